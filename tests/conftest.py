@@ -10,6 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+# Workers share the cores: threads of linear algebra that wait for each other make the run half as long again.
+if "--benchmark" not in sys.argv:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import jax
 import pytest
 import shapes
@@ -19,10 +23,6 @@ if TYPE_CHECKING:
     from south_sets import SouthSet
 
     from walop_jax.fit.refit import FitResult
-
-# Workers share the cores: threads of linear algebra that wait for each other make the run half as long again.
-if "--benchmark" not in sys.argv:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
 # Fixtures import what they need of the package: not the process that only hands out tests to workers.

@@ -139,13 +139,13 @@ def test_no_room_calls_upward_through_a_string():
 
 
 MOST_REACHED = {
-    "model.light": 4050,
+    "model.light": 3950,
     "likelihood.flux": 100,
-    "diagnosis.score": 850,
-    "commands.matrix": 23050,
-    "commands.refit": 28400,
-    "commands.diagnose": 31800,
-    "commands.apply": 31850,
+    "diagnosis.score": 780,
+    "commands.matrix": 16400,
+    "commands.refit": 26700,
+    "commands.diagnose": 30450,
+    "commands.apply": 31100,
 }
 """Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
 
@@ -189,23 +189,23 @@ def test_the_core_is_reached_without_the_rest(entry):
 
 
 MOST_LINES = {
-    "io": 1621,
+    "io": 1599,
     "instruments": 220,
-    "data": 5970,
+    "data": 5670,
     "sky": 435,
-    "model": 9626,
-    "likelihood": 3380,
-    "simulation": 1128,
-    "fit": 2190,
-    "calibration": 2845,
-    "posterior": 2380,
-    "science": 6300,
-    "diagnosis": 8110,
+    "model": 9521,
+    "likelihood": 3305,
+    "simulation": 1118,
+    "fit": 2055,
+    "calibration": 2655,
+    "posterior": 2205,
+    "science": 6110,
+    "diagnosis": 7650,
     "nights": 2810,
-    "plans": 2380,
-    "paper": 870,
-    "reports": 3035,
-    "commands": 4685,
+    "plans": 2315,
+    "paper": 815,
+    "reports": 2860,
+    "commands": 4645,
 }
 """Lines of each room: raising one is a decision of its own."""
 

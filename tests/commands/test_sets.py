@@ -89,7 +89,7 @@ def test_sets_are_inspected_one_by_one_and_as_one(fitted: FittedSet, tmp_path: P
     assert found.joint is not None
     assert found.joint.rows == sum(walop.read(path).intensities.rows for path in (fitted.calset, other))
     assert found.faults == ()
-    assert len(found.displays()) == 3
+    assert len(found.inspections) == 3
     broken = walop.inspect([fitted.calset, tmp_path / "none.fits"])
     assert broken.joint is None
     assert "no such file" in broken.faults[0]

@@ -69,7 +69,7 @@ class Hiding:
             tuple(_jittered(member, rng) for member in probe.group) if len(probe.group) == 1 else probe.group
         )
         probe = Probe(probe.name, probe.effect, group)
-        candidate = all_candidates(Columns(self.fit.likelihood, self.fit.values), [probe], ())[0][probe.name]
+        candidate = all_candidates(Columns(self.fit.likelihood, self.fit.values), [probe])[probe.name]
         columns = self.design.stacked([candidate.columns])
         step = rng.standard_normal(len(probe.widths)) * probe.widths
         step = np.where(probe.one_sided, np.abs(step), step)

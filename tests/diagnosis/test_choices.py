@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis import descriptions
-from walop_jax.diagnosis.descriptions import other_descriptions
+from walop_jax.diagnosis import exact
+from walop_jax.diagnosis.exact import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
@@ -76,7 +76,7 @@ def test_a_sentence_that_the_instrument_has_no_place_for_names_the_nearest(south
 def test_a_change_that_gained_nothing_is_not_compared_again(south, monkeypatch):
     """Once names have joined the model; one that did gain is, whatever its linear step leaves."""
     told: list[str] = []
-    monkeypatch.setattr(descriptions, "_screened", lambda result, asked, context: iter(()))
+    monkeypatch.setattr(exact, "_screened", lambda result, asked, context: iter(()))
     result = Mock(FitResult, model=Mock(Model, template=south, effect_names=()))
     earlier = {change: Choice(change, 2.0, -5.0) for change in alternatives(south)}
     asked = result, Context(), lambda: True, told.append

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from walop_jax.diagnosis import class_average as average
-from walop_jax.diagnosis.design import taken_up
+from walop_jax.diagnosis import class_product as average
 from walop_jax.diagnosis.score import Projector
 
 
@@ -53,7 +52,7 @@ def test_one_linear_step_is_the_least_squares_fit_of_the_other_model():
     left = residual + lost - basis @ (basis.T @ (residual + lost))
     projected = instead - basis @ (basis.T @ instead)
     b = -np.linalg.solve(projected.T @ projected, projected.T @ left)
-    by = -taken_up(others, Projector(others), lost + instead @ b)
+    by = -Projector(others).taken_up(Projector(others).basis.T @ (lost + instead @ b))
     right = np.linalg.lstsq(np.hstack([others, instead]), -data, rcond=None)[0]
     np.testing.assert_allclose(b, right[3:], rtol=1e-10)
     np.testing.assert_allclose(fit[:3] + by, right[:3], rtol=1e-10)

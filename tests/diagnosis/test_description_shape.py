@@ -11,9 +11,8 @@ from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
-from walop_jax.diagnosis.class_members import classes_of
+from walop_jax.diagnosis.class_members import classes_of, shape_changes
 from walop_jax.diagnosis.class_product import averaged, only_a_class
-from walop_jax.diagnosis.description_shape import shape_changes
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model, model_like
@@ -59,7 +58,7 @@ def test_patterns_are_all_polynomials_to_the_third_degree():
 def test_every_kind_may_be_as_large_as_the_description(described):
     """The sum over patterns of width² times the mean square of the factor is (SIZE x)² of the description."""
     state, _, _ = described
-    changes, widths = shape_changes(state.result, state.design.columns)
+    changes, widths, _ = shape_changes(state.result, state.design.columns)
     points, units = state.result.calset.points, state.result.model.template.units
     amplitude = state.result.values[state.result.model.index(f"described.{TEXT.replace(' ', '_')}")]
     square = amplitude**2 * np.average(

@@ -10,7 +10,7 @@ from matrix_at import matrix_at
 from score_draws import alarms, noise_scores
 from small_run import SEED, SMALL, small_fit
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.detection_limits import (
     DetectionLimits,

@@ -127,7 +127,7 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
     assert any(text.startswith("comparing ") for text in told)
     assert found.verdict == "unexplained"
     assert not found.steps
-    assert found.unexplained.term == ("exposures",)
+    assert found.unexplained.free_form == ("exposures",)
     assert found.unexplained.chi2_before == pytest.approx(found.before.chi2, rel=1e-9)
     assert found.unexplained.chi2_after == found.after.chi2
     assert found.unexplained.p_value == pytest.approx(found.p_value, rel=0.5)

@@ -10,7 +10,7 @@ from own_instrument import OWN
 from scipy import stats
 
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import dependences, grammar, thresholds
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, sentences_of
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
@@ -92,7 +92,7 @@ def said(laid, request):
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
-    made = all_candidates(Columns(laid.likelihood, laid.values), (), found)[1]
+    made = all_candidates(Columns(laid.likelihood, laid.values), found)
     return {name: candidate.columns for name, candidate in made.items()}
 
 
@@ -106,7 +106,7 @@ def test_names_are_sentences(laid, said):
     single = {}
     for name, columns in said.items():
         single |= dict(zip(name.split("; "), columns.T, strict=True))
-    theirs = all_candidates(Columns(laid.likelihood, laid.values), wanted, ())[0]
+    theirs = all_candidates(Columns(laid.likelihood, laid.values), wanted)
     assert {p.effect.name for p in wanted if p.name not in theirs} == {"etalon"}, (
         "wide gaps, blurred by the bands"
     )
@@ -188,7 +188,7 @@ def turning():
     calset = simulate(TURNING, seed=5).calset
     design = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     every = grammar.sentences(design.fit.model.template, calset.exposures, len(calset.points))
-    made = all_candidates(design.columns, (), every)[1].values()
+    made = all_candidates(design.columns, every).values()
     columns = [candidate.columns for candidate in made]
     names, widths = [candidate.name for candidate in made], [candidate.widths for candidate in made]
     return design, columns, ScoreSpace.projected(design.projector, names, widths, columns, exact=0)
@@ -231,8 +231,8 @@ def test_the_time_since_the_beginning_of_a_night_is_asked_of_several_nights(seco
 def test_steps_part_the_exposures_evenly_and_are_dated_between():
     """Midway between exposures; of many exposures every fourth time at first, then all times of the neighbourhood."""
     few = builders.exposures(*({"mjd": 61000.0 + hour / 24.0} for hour in (0, 1, 3, 4)))
-    assert dependences.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
-    assert dependences.between(2.0, dependences.end_of(few)) == "hours 2.0 to 4.5"
+    assert grammar.starts_of_steps(few) == pytest.approx([0.5, 2.0, 3.5], abs=1e-6)
+    assert grammar.between(2.0, grammar.end_of(few)) == "hours 2.0 to 4.5"
     instrument = nominal_instrument("WALOP-SOUTH")
     many = builders.exposures(
         *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from walop_jax.diagnosis.predictions import gains_of_units
+from walop_jax.diagnosis.refits import gains_of_units
 
 UNIT = np.repeat(["clp", "moon", "standard"], 100)
 

@@ -11,8 +11,8 @@ from small_run import SEED, SMALL, small_fit
 from walop_jax.data.records import Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.repeated_noise import pairs_alike, repeated_noise
 from walop_jax.diagnosis.trust import examined
+from walop_jax.diagnosis.variance_components import pairs_alike, repeated_noise
 from walop_jax.fit.refit import refit
 from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import simulate

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.diagnosis.candidate_scores import candidate_scores
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import corrected_p
+from walop_jax.diagnosis.trust import candidate_scores
 from walop_jax.model.effects import EFFECTS
 
 

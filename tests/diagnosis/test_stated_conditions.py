@@ -210,7 +210,7 @@ def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
     patches = effect_from_text("moon_patch=q:0/0/0,u:0/0/0", SMALL.context())
     wrong = refit(calset)
     named = refit(calset, with_effects(wrong.model, (patches,), SMALL.context()))
-    (told,) = rival_conditions(Design.of(wrong), named.chi2)
+    (told,) = rival_conditions(Design.of(wrong), condition_scores(Design.of(wrong)), named.chi2)
     assert "one number that the set states would, if it were " in told
     assert "the equinox of RA and DEC 20" in told
 
@@ -232,7 +232,7 @@ def an_hour_late(calset: CalibrationSet) -> CalibrationSet:
 def test_one_number_explains_data_in_which_no_name_was_found(change, what, size):
     calset = change(simulate(SMALL, seed=SEED).calset)
     wrong = refit(calset)
-    text = instead_of_names(wrong, wrong)
+    text = instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong)
     found = re.search(what, text)
     assert found, text
     assert float(found[1].replace("−", "-")) == pytest.approx(size, rel=0.1)
@@ -243,7 +243,7 @@ def test_where_no_number_explains_the_data_none_is_told():
         simulate(SMALL, seed=5, effects=[effect_from_text("camera_leakage=0.02", SMALL.context())]).calset
     )
     assert not wrong.explains_data
-    assert instead_of_names(wrong, wrong) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong) == ""
 
 
 def test_a_number_that_would_be_impossible_is_no_rival():
@@ -252,7 +252,7 @@ def test_a_number_that_would_be_impossible_is_no_rival():
     wrong = refit(simulate(SMALL, seed=SEED, effects=[wobble]).calset)
     neutral = wobble.kind.neutral(SMALL.context())
     right = refit(wrong.calset, with_effects(wrong.model, [neutral], SMALL.context()))
-    assert instead_of_names(wrong, right) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, right) == ""
 
 
 def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
@@ -264,7 +264,7 @@ def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
     assert wrong.noise_scale > 2.0
     assert named.noise_scale == 1.0
     monkeypatch.setattr(thresholds, "ALARM", np.inf)
-    assert instead_of_names(wrong, named) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, named) == ""
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():

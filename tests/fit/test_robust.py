@@ -129,7 +129,7 @@ def test_blocks_that_scatter_widely_make_the_covariance(monkeypatch):
     size, count = np.sqrt(np.diag(expansion.matrix)), 2 * len(model.free)
     gradients = 100.0 * rng.standard_normal((count, len(size))) * size
     monkeypatch.setattr(robust, "_gradients", lambda *_: iter([("blocks", gradients)]))
-    found = robust.robust_errors(result.likelihood, result.values, expansion).covariance
+    found, _ = robust.robust_errors(result.likelihood, result.values, expansion)
     inverse = np.linalg.inv(expansion.matrix / np.outer(size, size))
     scaled = gradients / size
     expected = inverse @ (count / (count - 1) * scaled.T @ scaled) @ inverse

@@ -11,9 +11,9 @@ from between_points import WORST, between_points
 from science.truth import TrueInstrument
 from scipy import stats
 
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.model.instrument import nominal_instrument

@@ -50,7 +50,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     from walop_jax.posterior.result import Options
     from walop_jax.posterior.sampling import sample
     from walop_jax.posterior.surrogate import build_surrogate
-    from walop_jax.posterior.target import Target, exact_density
+    from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
     calset = read_calibration_set(path)
     likelihood = Likelihood.of(calset, base_model(calset))
@@ -103,7 +103,7 @@ def measure(path: Path, nuts_draws: int, plain_steps: int) -> dict[str, Any]:
     found["plain_ess_per_second"] = 1.0 / (tau * found["numpy_evaluation_seconds"])
 
     if nuts_draws:
-        nuts, density = Nuts(warm_up=60), exact_density(target)
+        nuts, density = Nuts(warm_up=60), ExactPosterior(target, choose_sampled(target)).density()
         began = time.perf_counter()
         state = nuts.start(density, (0, 0))
         ready = time.perf_counter()

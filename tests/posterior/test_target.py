@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import exact_density
+from walop_jax.posterior.target import ExactPosterior, choose_sampled
 
 from .conftest import Scene
 
@@ -15,7 +15,7 @@ ROUNDING = 1e-10  # counts agree to 10⁻¹³, residuals of a thousand standard 
 
 @pytest.fixture(scope="module")
 def density(scene: Scene) -> Density:
-    return exact_density(scene.target)
+    return ExactPosterior(scene.target, choose_sampled(scene.target)).density()
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,8 @@ def test_its_gradient_is_that_of_finite_differences(
 
 def test_inflation_divides_chi2_by_f_squared(scene: Scene, density: Density, place: np.ndarray) -> None:
     """ln p = −½ (χ²/f² + priors + ln² f) − n ln f, by hand; its coordinate is ln f √(2n)."""
-    target, inflated = scene.target, exact_density(scene.target, inflate=True)
+    target = scene.target
+    inflated = ExactPosterior(target, choose_sampled(target), inflate=True).density()
     assert inflated.dimension == density.dimension + 1
     x, n = target.centre + target.root @ place, target.measured
     chi2, priors = target.data(x), float(np.sum(target.prior_rows(x) ** 2))

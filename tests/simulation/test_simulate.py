@@ -34,7 +34,7 @@ from walop_jax.simulation.observing_plan import (
     filter_curve,
     polariser_turn,
 )
-from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, truth_values
+from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, true_instrument, truth_values
 from walop_jax.sky.moon import body_direction
 
 FITS_DATA = Path(__file__).resolve().parents[2] / "fits_data"
@@ -416,3 +416,13 @@ def test_without_a_polariser_there_are_no_exposures_through_one(tmp_path):
         dataclasses.replace(plan, polariser_angles=(0.0, 90.0))
     with pytest.raises(ValueError, match="no exposures"):
         dataclasses.replace(plan, lamps=0)
+
+
+@pytest.mark.parametrize(
+    ("unpolarised", "lmax"), [(3, [0.55, 0.55, 0.55]), (1, [0.55, 0.45, 0.65])], ids=["all", "one"]
+)
+def test_wavelengths_of_largest_polarisation_are_those_of_polarised_standards(unpolarised, lmax):
+    """The first standards are the unpolarised ones; without any other the list is not used."""
+    plan = ObservingPlan(grid=2, standards=3, unpolarised=unpolarised, star_lmax=(0.45, 0.65))
+    _, truth = true_instrument(plan)
+    np.testing.assert_array_equal(truth.standard.lmax, lmax)

@@ -24,9 +24,12 @@ from small_run import small_fit  # noqa: E402
 
 from walop_jax.diagnosis import thresholds, trust  # noqa: E402
 from walop_jax.diagnosis.design import Design, pattern_scores  # noqa: E402
-from walop_jax.diagnosis.repeated_noise import repeated_noise  # noqa: E402
 from walop_jax.diagnosis.stated_conditions import Singles, scored, stated_conditions  # noqa: E402
-from walop_jax.diagnosis.variance_components import found_components, variance_components  # noqa: E402
+from walop_jax.diagnosis.variance_components import (  # noqa: E402
+    found_components,
+    repeated_noise,
+    variance_components,
+)
 
 
 def noise(design: Design, rng: np.random.Generator) -> np.ndarray:

@@ -10,9 +10,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
-
 STARS, LARGEST_P = 100, 0.05
+GOAL = 0.001
+"""Error of p that instruments are built for."""
+SMALLEST_DETERMINANT = 0.1
+"""|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
 
 
 def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:

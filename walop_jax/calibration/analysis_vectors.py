@@ -149,9 +149,8 @@ class AnalysisVectors:
     def added(self, setting: Settings, x: Vector, y: Vector) -> dict[int, Float[np.ndarray, "p k 3"]]:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
-            self._acting_in[setting.key] = {
-                n: entry for n, entry in self.acting.items() if acts_in(entry, self.instrument, setting)
-            }
+            acting = ((n, e) for n, e in self.acting.items() if acts_in(e, self.instrument, setting))
+            self._acting_in[setting.key] = dict(acting)
         acting = self._acting_in[setting.key]
         if not acting:
             return {}
@@ -227,9 +226,8 @@ class AnalysisVectors:
         def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
             interpolated, truth = (values.reshape(-1, len(columns)) for values in (interpolated, truth))
             largest = np.abs(truth).max(axis=0)
-            return float(
-                np.max(np.abs(interpolated - truth).max(axis=0) / np.where(largest > 0, largest, 1.0))
-            )
+            off = np.abs(interpolated - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)
+            return float(off.max())
 
         return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
 
@@ -256,8 +254,6 @@ class AnalysisVectors:
     ) -> FieldTable:
         table, off = accurate_table(exact, self._rectangle, counts, tolerance, error, truth=truth, total=True)
         if table is None or not off <= tolerance:
-            raise RuntimeError(
-                f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is "
-                "needed); an effect of the model has a very small scale"
-            )
+            what = f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is"
+            raise RuntimeError(f"{what} needed); an effect of the model has a very small scale")
         return table

@@ -39,7 +39,7 @@ from walop_jax.data.settings import (
     single_wavelength,
 )
 from walop_jax.fit.model_file import model_without_data, render
-from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
+from walop_jax.fit.parameter_table import Fitted, parameter_notes
 from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
@@ -173,21 +173,15 @@ class Product(Contents):
         names = self.names
         standards = standards_of(self.sources, self.exposures, self.filters)
         context = effect_context(adapted(self.design, standards=standards), self.exposures)
-        text = "\n".join(self.model_lines)
-        model = model_without_data(
-            self.design, text, standards=standards, context=context, catalogue=catalogue
-        )
+        facts = {"standards": standards, "context": context, "catalogue": catalogue}
+        model = model_without_data(self.design, "\n".join(self.model_lines), **facts)
         if sorted(model.names) != sorted(names):
             odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
-            raise DataError(
-                f"the model of the product has other parameters than it lists ({', '.join(odd[:3])}): it was "
-                "made by a version with other physics; fit again"
-            )
+            what = f"the model of the product has other parameters than it lists ({', '.join(odd[:3])})"
+            raise DataError(f"{what}: it was made by a version with other physics; fit again")
         order = np.array([names.index(name) for name in model.names])
-        contents: dict[str, Any] = _contents(self) | {
-            "values": self.values[order],
-            "covariance": self.covariance[np.ix_(order, order)],
-        }
+        contents, covariance = _contents(self), self.covariance[np.ix_(order, order)]
+        contents |= {"values": self.values[order], "covariance": covariance}
         if self.hidden is not None:
             contents["hidden"] = dataclasses.replace(self.hidden, changes=self.hidden.changes[:, order])
         return Calibration(model=model, file=self, **contents)
@@ -257,9 +251,8 @@ class Calibration(Contents, Fitted):
     def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
         verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
-        return dataclasses.replace(
-            self, covariance=covariance, verdict=verdict, date=now(), versions=software_versions()
-        )
+        made = {"date": now(), "versions": software_versions()}
+        return dataclasses.replace(self, covariance=covariance, verdict=verdict, **made)
 
     @property
     def instrument(self) -> str:
@@ -293,13 +286,8 @@ class Calibration(Contents, Fitted):
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
         }
-        return Display(
-            title=f"Calibration of {self.model.name}: {v.words}",
-            facts=tuple(facts.items()),
-            head=HEAD,
-            rows=parameter_rows(self.model, self.values, self.sigma),
-            notes=(*parameter_notes(self.model, self.sigma), *v.warnings),
-        )
+        notes = (*parameter_notes(self.model, self.sigma), *v.warnings)
+        return self.shown(f"Calibration of {self.model.name}: {v.words}", facts, notes)
 
     # ------------------------------------------------------------------------------- asking for the matrix
 
@@ -347,10 +335,8 @@ class Calibration(Contents, Fitted):
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
         """
-        matrix, slopes = slopes_over_field(
-            self.model.instrument(self.values), settings, self.curves(settings), x, y,
-            self.covariance, counts, tolerance,
-        )  # fmt: skip
+        at = self.model.instrument(self.values), settings, self.curves(settings), x, y
+        matrix, slopes = slopes_over_field(*at, self.covariance, counts, tolerance)
         matrix, slopes = matrix.reshape(len(x), -1), slopes.reshape(len(x), matrix[0].size, -1)
         covariance = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
         return matrix, covariance + of_structure(self.verdict.structure, matrix), slopes
@@ -441,10 +427,7 @@ class Calibration(Contents, Fitted):
         return beyond
 
     def new_maps(self, size: int = MAP_SIZE) -> MatrixMaps:
-        """The matrix over the field on a regular grid, computed anew, for a look at it.
-
-        In `usual_settings`, through the `usual_filter`.
-        """
+        """The matrix over the field on a regular grid, anew, in `usual_settings` through the `usual_filter`."""
         name = self.usual_filter
         half = float(np.ceil(np.max(np.abs(self.field)) * 50.0) / 50.0) or 0.3
         step = 2.0 * half / (size - 1)
@@ -488,11 +471,9 @@ class Calibration(Contents, Fitted):
     def provenance(self, content: str = "") -> dict[str, str]:
         """Cards of a table of matrices: the calibration (hash of its content), and the origin of the errors."""
         verdict = self.verdict
-        drawn = (
-            "draws of the posterior"
-            if self.draws is not None
-            else f"covariance of the {verdict.covariance_from}"
-        )
+        drawn = f"covariance of the {verdict.covariance_from}"
+        if self.draws is not None:
+            drawn = "draws of the posterior"
         return {
             "CALHASH": content or self.content_hash(),
             "ERRFROM": f"{drawn}, {verdict.errors_from}",
@@ -502,10 +483,7 @@ class Calibration(Contents, Fitted):
     def matrix_columns(
         self, x: Positions, y: Positions, settings: Settings, outside: Bool[np.ndarray, " p"]
     ) -> Columns:
-        """The matrix elements, their standard errors and FLAG, each with its description; NaN and 32 where `outside`.
-
-        Raises `DataError` for a filter that neither the calibration nor the package has.
-        """
+        """Matrix elements, standard errors and FLAG, each with its description; NaN and 32 where `outside`."""
         inside = np.flatnonzero(~outside)
         elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
         values, errors = np.full((2, len(x), elements.shape[1]), np.nan)
@@ -514,10 +492,8 @@ class Calibration(Contents, Fitted):
         flag = np.full(len(x), Quality.BEYOND_FIELD, np.int32)
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
         names = matrix_names(values.shape[1] // 3)
-        columns: Columns = {
-            name: (column, f"element {name.lower()} of the instrument matrix")
-            for name, column in zip(names, values.T, strict=True)
-        }
+        about = [f"element {name.lower()} of the instrument matrix" for name in names]
+        columns: Columns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
-from walop_jax.data.settings import BUILTIN_FILTERS, Settings
+from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -27,8 +27,6 @@ SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 UNMEASURED = 5e-4
 """Error of q and u (median over the field) allowed to a mistake without any data on it."""
 _POINTS = 64
-
-Vector = Float[np.ndarray, " p"]
 
 
 class Check(NamedTuple):
@@ -59,28 +57,16 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
 
 
 def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:
-    """All checks of a product that could be read, in a fixed order; those behind a failed one may be missing.
-
-    `catalogue` are the effects that its model may have.
-    """
-    checks = [
-        *_content(product),
-        *_verdict(product),
-        _covariance(product),
-        _validity(product),
-        _parents(product),
-    ]
+    """All checks of a product in a fixed order, up to a failed rebuild; `catalogue` are effects that it may have."""
+    earlier = UNCHECKED in product.verdict.warnings  # the content of others was checked when they were read
+    checks = [Check("content", False, UNCHECKED)] if earlier else []
+    checks += [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
     try:
         calibration = product.rebuilt(catalogue)
     except ValueError as error:
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), *_protection(calibration)]
-
-
-def _content(product: Product) -> list[Check]:
-    """A failure for products of an earlier rule; the content of others was checked when they were read."""
-    return [Check("content", False, UNCHECKED)] if UNCHECKED in product.verdict.warnings else []
 
 
 def _verdict(product: Product) -> list[Check]:
@@ -126,9 +112,8 @@ def _validity(product: Product) -> Check:
 def _parents(product: Product) -> Check:
     bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
     good = bool(product.inputs) and not bad
-    return Check(
-        "parents", good, f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
-    )
+    text = f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
+    return Check("parents", good, text)
 
 
 def _maps(product: Product, calibration: Calibration) -> Check:
@@ -137,44 +122,28 @@ def _maps(product: Product, calibration: Calibration) -> Check:
         return Check("maps", False, "are not of the grid and setting that this program makes")
     off = float(np.abs(again.values - product.maps.values).max())
     errors = np.allclose(again.errors, product.maps.errors, rtol=1e-4, atol=1e-15)  # some elements have none
-    return Check(
-        "maps",
-        off < MAP_TOLERANCE and errors,
-        f"differ from those of the parameters by {rounded(off, '.2g')}",
-    )
-
-
-def _places(calibration: Calibration) -> tuple[Settings, Vector, Vector]:
-    """The usual setting, and places over the field (deg)."""
-    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
-    x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
-    return calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0])), x, y
+    text = f"differ from those of the parameters by {rounded(off, '.2g')}"
+    return Check("maps", off < MAP_TOLERANCE and errors, text)
 
 
 def _physics(calibration: Calibration) -> Check:
     """In no arm does a camera see less than no light, whatever the polarisation: a₀ ≥ √(a₁² + a₂²)."""
-    setting, x, y = _places(calibration)
+    limit = min(calibration.model.template.field_limit, float(np.abs(calibration.field).max()))
+    x, y = np.random.default_rng(0).uniform(-limit, limit, (2, _POINTS))
+    setting = calibration.usual_settings(filter_name=str(np.unique(calibration.exposures.filter)[0]))
     analysis = AnalysisVectors(calibration)
     vectors = analysis.exact(setting, x, y)[:, 0]
     least = np.min(1.0 - np.hypot(vectors[..., 1], vectors[..., 2]) / vectors[..., 0], axis=0)
     cameras = analysis.instrument.cameras
-    transmissions = ", ".join(
-        f"{'/'.join(cameras.names[k] for k in arm)} {rounded(least[list(arm)].min(), '.2g')}"
-        for arm in cameras.arms
-    )
+    arms = (("/".join(cameras.names[k] for k in arm), least[list(arm)].min()) for arm in cameras.arms)
+    transmissions = ", ".join(f"{names} {rounded(value, '.2g')}" for names, value in arms)
     good = bool(np.all(vectors[..., 0] > 0)) and bool(np.all(least > -DARKEST))
-    return Check(
-        "physics",
-        good,
-        f"least transmission for any polarisation, over that of unpolarised light: {transmissions}",
-    )
+    what = "least transmission for any polarisation, over that of unpolarised light"
+    return Check("physics", good, f"{what}: {transmissions}")
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """A statement of mistakes that could hide, at the limits of the data; unmeasured ones fail.
-
-    It may do no more to stars than `UNMEASURED`.
-    """
+    """Mistakes that could hide, at the limits of the data; unmeasured ones fail beyond `UNMEASURED`."""
     if calibration.hidden is None:
         yield Check("protection", True, "undetectable errors were not computed")
         return

@@ -71,9 +71,7 @@ class CheckedInstrument(Displayed):
         path += [(f"  {name}", " > ".join(elements)) for name, elements in self.arms.items()]
         moving = ", ".join(f"{prefix}_IN, {prefix}_ANGLE" for prefix in self.moving)
         path.append(("moves", moving or "nothing"))
-        path += [
-            (place, f"retards by {waves:.3f} waves at 0.62 um") for place, waves in self.retardance.items()
-        ]
+        path += [(place, f"retards by {w:.3f} waves at 0.62 um") for place, w in self.retardance.items()]
         return Display(
             title=f"{design.name}: {len(design.cameras)} cameras ({', '.join(design.cameras.names)})",
             facts=(*path, ("field", f"to {design.field_limit:g} deg")),

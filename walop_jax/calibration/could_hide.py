@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
-from walop_jax.calibration.matrix import matrix_slopes, planned_matrices
-from walop_jax.data.records import FilterCurve
+from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrices
 from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
 from walop_jax.likelihood.field_table import Vector
@@ -61,12 +60,9 @@ class CouldHide(NamedTuple):
     @property
     def in_words(self) -> str:
         """Name, and the size at which it would just be detected, or the usual one of an unmeasured mistake."""
-        size = (
-            f"{rounded(self.size, '.2g')} {self.unit}"
-            if self.unit
-            else f"{rounded(100 * self.size, '.2g')} %"
-        )
-        return f"{self.name} ({'an error of' if self.measured else 'not measured; usual size'} {size})"
+        size, unit = (self.size, self.unit) if self.unit else (100 * self.size, "%")
+        what = "an error of" if self.measured else "not measured; usual size"
+        return f"{self.name} ({what} {rounded(size, '.2g')} {unit})"
 
 
 def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
@@ -187,9 +183,8 @@ def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
 def is_ahead(calibration: Calibration, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
     instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
-    after, before = (
-        np.asarray(light.telescope(m, zero, zero)) for m in (with_effect(instrument, effect), instrument)
-    )
+    models = with_effect(instrument, effect), instrument
+    after, before = (np.asarray(light.telescope(model, zero, zero)) for model in models)
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
 
 
@@ -209,16 +204,9 @@ def turn_of(instrument: Instrument, effect: Effect) -> float:
 
 
 def change_by_effect(
-    instrument: Instrument,
-    effect: Effect,
-    setting: Settings,
-    filters: Mapping[str, FilterCurve],
-    x: Vector,
-    y: Vector,
+    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: Vector, y: Vector
 ) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix with an effect at its size, less the one without, in one setting."""
-    after, before = (
-        planned_matrices(m, plan_for_settings(m, setting, filters), x, y)
-        for m in (with_effect(instrument, effect), instrument)
-    )
+    models = with_effect(instrument, effect), instrument
+    after, before = (planned_matrices(m, plan_for_settings(m, setting, filters), x, y) for m in models)
     return after - before

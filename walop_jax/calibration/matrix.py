@@ -39,6 +39,7 @@ from walop_jax.model.specification import Model, series_indices
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
+Filters = Mapping[str, FilterCurve]
 _MARK = 2.0**40
 """A value that no parameter has: it finds the amplitudes of effects among all parameters."""
 
@@ -104,9 +105,8 @@ class ResidualMap:
 
     def __post_init__(self) -> None:
         if len(self.values) % 4 != 3:
-            raise ValueError(
-                f"{len(self.values)} planes, for A arms there are 3 A elements and A − 1 throughputs"
-            )
+            what = "for A arms there are 3 A elements and A − 1 throughputs"
+            raise ValueError(f"{len(self.values)} planes, {what}")
 
     @property
     def arms(self) -> int:
@@ -164,9 +164,8 @@ def _slopes_at(
 
         def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
             changed, rows = to_instrument(values), optics.band_rows(values, instrument, settings, x, y)
-            return (light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y))[
-                ..., :3
-            ]
+            seen = light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y)
+            return seen[..., :3]
 
         derivatives = linearised(instrument, vectors, instrument.throughput.at(x, y))
         return derivatives.value, jnp.concatenate([derivatives.plain, derivatives.local])
@@ -179,17 +178,9 @@ _slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="
 
 
 def analysis_vectors(
-    instrument: Instrument,
-    plan: Plan,
-    x: Vector,
-    y: Vector,
-    *,
-    from_sky: bool = False,
+    instrument: Instrument, plan: Plan, x: Vector, y: Vector, *, from_sky: bool = False
 ) -> Float[np.ndarray, "p b k 4"]:
-    """Analysis vectors (point, band, camera, Stokes) at field positions in degrees.
-
-    For light behind the telescope, or `from_sky`, which passes the telescope first.
-    """
+    """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
     vectors, telescope = _in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
@@ -254,7 +245,7 @@ def _matrix_and_slopes(
 def matrices(
     instrument: Instrument,
     settings: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     covariance: Float[np.ndarray, "n n"],
@@ -284,12 +275,7 @@ def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
 
 
 def matrix_draws(
-    model: Model,
-    draws: Float[np.ndarray, "d n"],
-    settings: Settings,
-    filters: Mapping[str, FilterCurve],
-    x: Vector,
-    y: Vector,
+    model: Model, draws: Float[np.ndarray, "d n"], settings: Settings, filters: Filters, x: Vector, y: Vector
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
@@ -305,7 +291,7 @@ def matrix_draws(
 
 
 def matrix_slopes(
-    instrument: Instrument, setting: Settings, filters: Mapping[str, FilterCurve], x: Vector, y: Vector
+    instrument: Instrument, setting: Settings, filters: Filters, x: Vector, y: Vector
 ) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
@@ -315,14 +301,13 @@ def matrix_slopes(
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    matrix, slopes = _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
-    return matrix, slopes
+    return _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
 
 
 def slopes_over_field(
     instrument: Instrument,
     setting: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     covariance: Float[np.ndarray, "n n"],
@@ -337,9 +322,8 @@ def slopes_over_field(
     exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
     def error(interpolated: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.ndarray]) -> float:
-        errors, true_errors = (
-            np.sqrt(np.sum(slopes @ covariance * slopes, axis=-1)) for _, slopes in (interpolated, truth)
-        )
+        tables = interpolated, truth
+        errors, true_errors = (np.sqrt(np.sum(s @ covariance * s, axis=-1)) for _, s in tables)
         return float(np.max(np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)))
 
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
@@ -370,15 +354,12 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
 def effect_slopes(
     instrument: Instrument,
     setting: Settings,
-    filters: Mapping[str, FilterCurve],
+    filters: Filters,
     x: Vector,
     y: Vector,
     effects: tuple[Effect, ...],
 ) -> Float[np.ndarray, "p a 3 e"]:
-    """Derivatives of the matrix with respect to the amplitudes of neutral effects, effect by effect in their order.
-
-    Parts of an effect outside the matrix (single exposures, ghosts, detectors) have none.
-    """
+    """Derivatives of the matrix to the amplitudes of neutral effects, in order; parts outside the matrix have none."""
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
     neutral, put = with_amplitudes(instrument, effects)

@@ -22,11 +22,9 @@ class MatrixTable(Table):
 
     def __str__(self) -> str:
         complete = {"X", "Y"} <= set(self.colnames) and self._elements()
-        return (
-            "\n".join(map(self._block, range(len(self))))
-            if complete and len(self) <= self.FEW
-            else super().__str__()
-        )
+        if not complete or len(self) > self.FEW:
+            return super().__str__()
+        return "\n".join(map(self._block, range(len(self))))
 
     __repr__ = __str__
 
@@ -40,17 +38,15 @@ class MatrixTable(Table):
             return float((column.quantity.to_value("deg") if has_unit else np.asarray(column))[row])
 
         x, y = (with_minus_sign(f"{number(name):+.3f}°") for name in ("X", "Y"))
-        cells = [
-            f"{name.lower()} {with_error(number(name), number(f'{name}_ERR'))}" for name in self._elements()
-        ]
+        elements = ((name, number(name), number(f"{name}_ERR")) for name in self._elements())
+        cells = [f"{name.lower()} {with_error(value, error)}" for name, value, error in elements]
         width = max(map(len, cells)) + 3
         # `matrix` itself writes both columns; those of a user's table may be texts, or masked.
         inside = [name[:-3] for name in self.colnames if name.endswith("_IN") and self[name][row] is np.True_]
         stand = "".join(f", {prefix} at {number(f'{prefix}_ANGLE'):g}°" for prefix in inside)
         lines = [f"field point X {x}, Y {y}{stand}"]
-        lines += [
-            "  " + "".join(f"{cell:<{width}}" for cell in cells[k : k + 3]) for k in range(0, len(cells), 3)
-        ]
+        rows = (cells[k : k + 3] for k in range(0, len(cells), 3))
+        lines += ["  " + "".join(f"{cell:<{width}}" for cell in row) for row in rows]
         if "P_ERR" in self.colnames:
             error_of_p, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
             lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {error_of_p}; FLAG {flag}")

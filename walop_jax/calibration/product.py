@@ -74,6 +74,7 @@ _MISTAKE: Mapping[str, tuple[str, Any]] = {
 }
 """Numbered words of HIDDEN: the field of `Hidden` that each one is, and its value where it is absent."""
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
+_FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
 _LONGEST_SOFTWARE_LIST = 30
 _EXTENSIONS = re.compile(
@@ -114,10 +115,7 @@ def write_calibration(
 
 
 def content_of(hdus: Iterable[Any]) -> str:
-    """SHA-256 of words, columns and images, as in a file; the order of extensions does not matter.
-
-    Not of dates, software, paths, and additions by others.
-    """
+    """SHA-256 of words, columns, images, extensions in any order; not of dates, software, paths, additions."""
     digest = hashlib.sha256()
     for name, hdu in sorted(((hdu.name.strip().upper(), hdu) for hdu in hdus), key=lambda pair: pair[0]):
         if not _EXTENSIONS.fullmatch(name):
@@ -160,7 +158,6 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         for name, columns in tables.items()
         if len(next(iter(columns.values())))
     }
-    version = _version(c)
     instrument_name(c.instrument, Place(path, "PRIMARY"))
     images = [fits.ImageHDU(c.covariance, name="COVARIANCE")]
     for suffix, planes in (("", c.maps.values), ("_ERR", c.maps.errors)):
@@ -172,7 +169,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
         images.append(_hidden_hdu(c.hidden))
     parameters, filters = hdus.pop("PARAMETERS"), hdus.pop("FILTERS")
     exposures = set_table_hdu("EXPOSURES", c.exposures.columns(), path)
-    return [_primary(c, version), parameters, *images, filters, exposures, *hdus.values()]
+    return [_primary(c), parameters, *images, filters, exposures, *hdus.values()]
 
 
 def _parameter_columns(c: Product) -> dict[str, np.ndarray]:
@@ -193,15 +190,11 @@ def _strings(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
 
 
-def _version(c: Product) -> int:
-    """The oldest version of the format that can hold a calibration."""
-    newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
-    return 1 if not newer and np.isin(c.exposures.kind, ("clp", "moon", "standard", "flux")).all() else 2
-
-
-def _primary(c: Product, version: int) -> fits.PrimaryHDU:
+def _primary(c: Product) -> fits.PrimaryHDU:
     """The primary header: verdict, validity, software, content hash."""
-    verdict, site = c.verdict, c.site
+    verdict, site, structure = c.verdict, c.site, c.verdict.structure
+    newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
+    version = 1 if not newer and np.isin(c.exposures.kind, _FIRST_KINDS).all() else PRODVERS
     cards: Cards = {
         "TELESCOP": (site.telescope, ""),
         "INSTRUME": (c.instrument, ""),
@@ -221,19 +214,10 @@ def _primary(c: Product, version: int) -> fits.PrimaryHDU:
         "QUALITY": (int(verdict.quality), "bit mask, 0 is good"),
         "COVFROM": (verdict.covariance_from, "what COVARIANCE is of"),
         "ERRFROM": (verdict.errors_from, ""),
-        **(
-            {
-                "STRUCTG": (verdict.structure.gain, "rms gain of a camera at a field point"),
-                "STRUCTR": (verdict.structure.response, "rms response of a camera to q, u there"),
-            }
-            if verdict.structure
-            else {}
-        ),
+        "STRUCTG": (structure.gain if structure else np.nan, "rms gain of a camera at a field point"),
+        "STRUCTR": (structure.response if structure else np.nan, "rms response of a camera to q, u there"),
         "MAPFILT": (c.maps.filter, f"filter of the maps M21...{c.maps.names[-1]}"),
-        **{
-            name: (edge, "[deg] extent of the field points used")
-            for name, edge in zip(_FIELD, c.field, strict=True)
-        },
+        **{n: (at, "[deg] extent of the field points used") for n, at in zip(_FIELD, c.field, strict=True)},
         **_validity_cards(c),
         "HASHRULE": (HASHRULE, "what CONTHASH covers"),
         "CONTHASH": ("", ""),  # when all is there
@@ -275,9 +259,7 @@ def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fi
 
 
 def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
-    hdus = [
-        _map_hdu(name, getattr(residuals, attribute), residuals) for name, attribute in _RESIDUALS.items()
-    ]
+    hdus = [_map_hdu(name, getattr(residuals, field), residuals) for name, field in _RESIDUALS.items()]
     for hdu in hdus:
         hdu.header["FILTER"] = residuals.filter
         if (angle := residuals.positions.get(CALIBRATION_PLATE)) is not None:
@@ -350,12 +332,12 @@ class _Reader:
         table = self.table("PARAMETERS")
         self.check_parameters(table, covariance)
         model_lines = tuple(self.table("MODEL")["LINE"].tolist())
-        site = Site(
-            self.text("TELESCOP"), *(self.number(f"SITE{n}", np.nan) for n in ("LAT", "LONG", "ELEV"))
-        )
+        numbers = (self.number(f"SITE{name}", np.nan) for name in ("LAT", "LONG", "ELEV"))
+        site = Site(self.text("TELESCOP"), *numbers)
         filters = make_filters(self.table("FILTERS"), Place(self.path, "FILTERS"))
         stars, inputs = self.table("SOURCES", optional=True), self.table("INPUTS", optional=True)
         warnings, description = self.table("WARNINGS", optional=True), self.table("INSTRUMENT", optional=True)
+        parents = zip(inputs["PATH"], inputs["SHA256"], strict=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
         low_x, high_x, low_y, high_y = map(self.number, _FIELD)
         return Product(
@@ -363,7 +345,7 @@ class _Reader:
             parameters=_listed(table, model_lines),
             maps=maps,
             model_lines=model_lines,
-            description=tuple(description["LINE"].tolist()) if description else (),
+            description=tuple(description["LINE"].tolist()),
             values=table["VALUE"],
             covariance=covariance,
             verdict=Verdict.recorded(
@@ -374,23 +356,20 @@ class _Reader:
                 converged=self.flag("CONVERGD"),
                 trusted=self.flag("TRUSTED"),
                 quality=int(self.number("QUALITY")),
-                warnings=(
-                    *(warnings["TEXT"].tolist() if warnings else ()),
-                    *(() if "HASHRULE" in self.header else (UNCHECKED,)),
-                ),
+                warnings=(*warnings["TEXT"].tolist(), *(() if "HASHRULE" in self.header else (UNCHECKED,))),
                 covariance_from=self.text("COVFROM") or "fit",
                 errors_from=self.text("ERRFROM") or STATED,
                 structure=Structure(self.number("STRUCTG", 0.0), self.number("STRUCTR", 0.0)),
             ),
             filters=filters,
             exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(stars, Place(self.path, "SOURCES"), filters) if stars else Sources.none(),
+            sources=make_sources(stars, Place(self.path, "SOURCES"), filters)
+            if "SOURCES" in self.hdus
+            else Sources.none(),
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),
-            inputs=tuple(InputFile(Path(p), s) for p, s in zip(inputs["PATH"], inputs["SHA256"], strict=True))
-            if inputs
-            else (),
+            inputs=tuple(InputFile(Path(path), sha256) for path, sha256 in parents),
             residuals=self.residuals(maps.arms),
             hidden=self.hidden(len(table["NAME"])),
             date=self.text("DATE"),
@@ -452,9 +431,9 @@ class _Reader:
     # ---------------------------------------------------------------------------- tables and images
 
     def table(self, name: str, *, optional: bool = False) -> dict[str, Any]:
-        """The columns of a table; empty for one that is `optional` and not there."""
+        """The columns of a table; without rows for one that is `optional` and not there."""
         if optional and name not in self.hdus:
-            return {}
+            return {column: np.zeros(0, np.str_) for column in TABLES[name]}
         hdu, place = self.hdu(name), Place(self.path, name)
         rules = TABLES.get(name) or table_rules(name, column_names(hdu, place), place)
         return read_table(hdu, rules, place)[0]
@@ -591,9 +570,7 @@ def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Param
     for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
         start = float(entry.get("start", np.nan if prior is None else mean))
-        tie = entry.get("tie")
         part = str(name).partition(".")[0]  # names are all that a file has
-        parameters.append(
-            Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, tie=tie, part=part)
-        )
+        further = {"tie": entry.get("tie"), "part": part}
+        parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **further))
     return tuple(parameters)

@@ -59,8 +59,8 @@ def _point_sums(
     instrument: Instrument,
     plan: Plan,
     chosen: Bool[Array, " e"],
-    point: engine.PointData,
     nodes: FieldTable | None,
+    point: engine.PointData,
 ) -> Float[Array, " n"]:
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
@@ -72,9 +72,8 @@ def _point_sums(
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
     change = jnp.moveaxis(project_flux(change, unit * weight, fixed, shared), 0, 1)
     measured = (point.weight[:, 0] > 0) & chosen
-    freedom = jnp.sum(
-        jnp.where(measured, unit.shape[-1] - jnp.where(fixed, 0.0, instrument.cameras.fluxes), 0.0)
-    )
+    degrees = unit.shape[-1] - jnp.where(fixed, 0.0, instrument.cameras.fluxes)
+    freedom = jnp.sum(jnp.where(measured, degrees, 0.0))
     chi2 = jnp.sum(jnp.where(chosen[:, None], residual, 0.0) ** 2)
     right = jnp.einsum("edk,ek->d", change, residual)
     matrix = jnp.einsum("edk,efk->df", change, change)[np.triu_indices(len(right))]
@@ -88,11 +87,8 @@ def _batch_sums(
     data: engine.PointData,
     nodes: FieldTable | None,
 ) -> Float[Array, "p n"]:
-    return jax.lax.map(
-        lambda point: _point_sums(instrument, plan, chosen, point, nodes),
-        data,
-        batch_size=limits.JACOBIAN_BLOCK,
-    )
+    sums = functools.partial(_point_sums, instrument, plan, chosen, nodes)
+    return jax.lax.map(sums, data, batch_size=limits.JACOBIAN_BLOCK)
 
 
 _sums = compiled(_batch_sums)
@@ -102,10 +98,8 @@ def cells_for(points: int, census: Census) -> Grid:
     """A grid of square-ish cells over the used part of the field: `POINTS_PER_CELL` points in each, or more."""
     low_x, high_x, low_y, high_y = census.field
     side = int(np.clip(np.sqrt(points / POINTS_PER_CELL), 1, limits.CELLS))
-    width, height = (high_x - low_x) / side, (high_y - low_y) / side
-    return Grid(
-        side, side, (0.5, 0.5), (low_x, low_y), ((width or 1.0, 0.0), (0.0, height or 1.0))
-    )  # fmt: skip
+    width, height = (high_x - low_x) / side or 1.0, (high_y - low_y) / side or 1.0
+    return Grid(side, side, (0.5, 0.5), (low_x, low_y), ((width, 0.0), (0.0, height)))
 
 
 def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
@@ -153,9 +147,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | No
         batches = likelihood.points.slab(number)
         cell = np.concatenate([cell_of(grid, np.asarray(batch.x), np.asarray(batch.y)) for batch in batches])
         # Padded points carry no weight, hence zeros.
-        columns = [
-            np.asarray(_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes)) for c in batches
-        ]
+        columns = [_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes) for c in batches]
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
         return np.concatenate(sums)
 
@@ -175,9 +167,8 @@ def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
     likelihood, cells = frame.likelihood, frame.cells
     exposures = likelihood.calset.exposures
     measured = frame.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
-    setting, chosen = _main_setting(
-        Settings.of(exposures, likelihood.plan.moving), exposures.clp_in & measured
-    )
+    settings = Settings.of(exposures, likelihood.plan.moving)
+    setting, chosen = _main_setting(settings, exposures.clp_in & measured)
     blocks = (POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.CELLS)
     together = int(np.ceil(max(1.0, *blocks)))
     s, t = np.meshgrid(*cells.middles())
@@ -195,12 +186,8 @@ def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
         matrix += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
     degrees = likelihood.cameras - np.where(likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes)
     freedom = np.einsum("e,erc->rc", degrees[chosen], frame.sums.used[chosen])
-    shaped = (
-        frame.sums.chi2[chosen].sum(axis=0),
-        freedom,
-        right.reshape(n, *s.shape),
-        matrix.reshape(n, n, *s.shape),
-    )
+    right, matrix = right.reshape(n, *s.shape), matrix.reshape(n, n, *s.shape)
+    shaped = (frame.sums.chi2[chosen].sum(axis=0), freedom, right, matrix)
     sums = [in_blocks(values, together) for values in shaped]
     grid = cells.blocks(together, sums[0].shape)
     chi2, freedom, right, matrix = (values.reshape(*values.shape[:-2], -1) for values in sums)

@@ -20,11 +20,13 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """The content of `summary.json`, key by key as in docs: files. Frozen parameters have sigma 0.
-
-    Raises RuntimeError for a fit without a verdict.
-    """
+    """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0."""
     verdict = result.checked_verdict()
+    mistakes, hidden = None, result.hidden
+    if hidden is not None:
+        columns = (hidden.names, hidden.sizes, hidden.units, hidden.kinds, hidden.measured)
+        keys = ("name", "size", "unit", "kind", "measured")
+        mistakes = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
@@ -45,14 +47,7 @@ def summary(
         "doubts": list(verdict.doubts),
         "warnings": list(verdict.warnings),
         "structure": dataclasses.asdict(verdict.structure),
-        "hidden": None
-        if result.hidden is None
-        else [
-            dict(zip(("name", "size", "unit", "kind", "measured"), (*e, kind, measured), strict=True))
-            for e, kind, measured in zip(
-                result.hidden.each(), result.hidden.kinds, result.hidden.measured, strict=True
-            )
-        ],
+        "hidden": mistakes,
         "accuracy_of_p": None if accuracy is None else accuracy.document(),
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

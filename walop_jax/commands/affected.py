@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 OLD = Argument("Calibration that the catalogues were reduced with, or its run.", "OLD", Path)
 NEW = Argument("Calibration that takes its place.", "NEW", Path)
 CATALOGUES = Argument("Catalogues, as apply reads or writes them.", "CATALOGUE...", list[Path])
-FOLDER = Option(f"Folder for {AFFECTED}.", "RUN", Path, "-o")
 LIMIT = Option("Shift (standard errors) from which a result is made again (default: 0.5).", "SIGMA", float)
 
 
@@ -28,7 +27,7 @@ def affected(
     new: Annotated[Product, NEW],
     catalogues: Annotated[Any, CATALOGUES],
     *,
-    output: Annotated[PathLike | None, FOLDER] = None,
+    output: Annotated[PathLike | None, Option(f"Folder for {AFFECTED}.", "RUN", Path, "-o")] = None,
     limit: Annotated[float, LIMIT] = 0.5,
     effects: Effects = None,
 ) -> Outcome[Affected]:
@@ -75,9 +74,8 @@ def affected(
             shifts_of_catalogue = list(nights_of(before, after, rows, name, limit))
         nights += shifts_of_catalogue
         if beyond := sum(night.beyond for night in shifts_of_catalogue):
-            warnings.append(
-                f"{name}: {beyond} stars have a filter or temperature that the new one does not cover"
-            )
+            what = "stars have a filter or temperature that the new one does not cover"
+            warnings.append(f"{name}: {beyond} {what}")
     first, second = (", ".join(dict.fromkeys(hashes)) for hashes in (replaced, replacing))
     shifts = Affected(first, second, limit, tuple(nights), tuple(warnings))
     return Outcome(shifts, saved_as=AFFECTED, warnings=shifts.warnings, trusted=not shifts.again)

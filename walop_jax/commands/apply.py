@@ -37,7 +37,7 @@ CATALOGUE = Argument(
     list[Path],
 )
 COMMON = Option(
-    "Write the common table of stellar polarisation (Panopoulou et al. 2025), with Galactic q, u."
+    "Write the common table of stellar polarisation (Panopoulou et al. 2025), also Galactic q, u."
 )
 DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
 SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
@@ -135,9 +135,7 @@ def apply(
     job.tell("tabulating the analysis vectors", "tabulating")
     used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
-        stars = apply_to_rows(
-            used, rows, lambda done, total: job.tell(f"{done} of {total} rows"), force=force
-        )
+        stars = apply_to_rows(used, rows, lambda n, total: job.tell(f"{n} of {total} rows"), force=force)
         seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
     columns = stokes_columns(stars, rows.star, debias)

@@ -14,8 +14,6 @@ from walop_jax.io.progress import Stage
 if TYPE_CHECKING:
     from walop_jax.fit.outliers import Clipped
 
-SIGMA = Option("Standard errors beyond which a row is flagged, at least 3.", "N")
-
 
 @command(stages=("reading", "fitting", "writing"), writes="file", random=True)
 def clip(
@@ -23,7 +21,7 @@ def clip(
     data: Sets,
     *,
     output: SetFile = None,
-    sigma: Annotated[float, SIGMA] = 5.0,
+    sigma: Annotated[float, Option("Standard errors beyond which a row is flagged, at least 3.", "N")] = 5.0,
     model: ModelLike = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,

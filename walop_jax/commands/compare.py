@@ -70,13 +70,11 @@ def compare(
     else:
         calset, chosen = set_of(data), held.model
     if [len(arm.analyser.cameras) for arm in chosen.template.arms] != [2, 2]:
-        raise fail(
-            f"Paper II has a method for two arms of two cameras, which {chosen.name} is not; refit and diagnose"
-        )
+        what = f"Paper II has a method for two arms of two cameras, which {chosen.name} is not"
+        raise fail(f"{what}; refit and diagnose")
     if truth is not None:
-        truth = Truth(
-            *(truth if isinstance(truth, tuple) else true_matrices(truth, chosen.template.patched()))
-        )
+        in_memory = isinstance(truth, tuple)
+        truth = Truth(*(truth if in_memory else true_matrices(truth, chosen.template.patched())))
     if held is None:
         job.tell("fitting the joint model", "fitting")
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)

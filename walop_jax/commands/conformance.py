@@ -12,16 +12,14 @@ if TYPE_CHECKING:
 
 SHIPPED = ("cases.csv", "given.csv", "answers.csv", "README.txt")
 RESULTS = "results.csv"
-MAKE = Option("Write the questions as tables.", "FOLDER", Path)
-CHECK = Option("Judge FOLDER/results.csv.", "FOLDER", Path)
 
 
 @command(jax=False, writes=())
 def conformance(
     job: Job,
     *,
-    make: Annotated[PathLike | None, MAKE] = None,
-    check: Annotated[PathLike | None, CHECK] = None,
+    make: Annotated[PathLike | None, Option("Write the questions as tables.", "FOLDER", Path)] = None,
+    check: Annotated[PathLike | None, Option("Judge FOLDER/results.csv.", "FOLDER", Path)] = None,
 ) -> Outcome[int | Conformance]:
     """Put another program to the test: 43 small questions on signs, frames, order of cameras, errors and bias.
 

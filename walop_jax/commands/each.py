@@ -59,8 +59,8 @@ def for_each(
             warnings += outcome.warnings
     failed = [outcome.failure for outcome in ended if outcome.failure]
     if existing := len(files) - len(calls):
-        there = f"{existing} of {len(files)} tables were there already"
-        warnings.append(f"{there}, and are left; --overwrite makes them again")
+        what = f"{existing} of {len(files)} tables were there already"
+        warnings.append(f"{what}, and are left; --overwrite makes them again")
     return Outcome(
         places,
         {

@@ -9,12 +9,8 @@ from typing import Annotated, Any
 from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
 from walop_jax.commands.inputs import TableFile
 
-FILES = Argument(
-    "FITS files, a JSON export of a log, a table of words, or a schedule.", "FILE...", list[Path]
-)
-WORDS = Option(
-    "Which word is which column, and what filters are numbered.", "WORDS.toml", Path, required=True
-)
+FILES = Argument("FITS files, a JSON export of a log, a table of words or a schedule.", "FILE...", list[Path])
+WORDS = Option("Which word is which column, which numbers are filters.", "WORDS.toml", Path, required=True)
 
 
 @command(writes="file", jax=False)

@@ -103,9 +103,8 @@ def gather(
         "remarks": remarks,
     }
     text = f"{output}: {len(table)} stars, {by_cameras[-1]} of them in all {len(names)} cameras"
-    return Outcome(
-        table, document, text, warnings=remarks, next=(f"walop-jax apply RUN {output} -o OUT.fits",)
-    )
+    next_step = f"walop-jax apply RUN {output} -o OUT.fits"
+    return Outcome(table, document, text, warnings=remarks, next=(next_step,))
 
 
 def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
@@ -115,9 +114,8 @@ def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
         stated = telling & set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))
         if len(stated) == 1 and name.upper() not in stated:
             what = f"{path} is given in the place of camera {name}"
-            raise UsageError(
-                f"{what}: the order is {', '.join(names)}; rename it if it is of {name}", "catalogues"
-            )
+            what += f": the order is {', '.join(names)}; rename it if it is of {name}"
+            raise UsageError(what, "catalogues")
 
 
 def _pointing(
@@ -129,9 +127,8 @@ def _pointing(
     from walop_jax.sky.directions import Pointing
 
     first, remarks = catalogues[0], []
-    numbers = {
-        name: angle_of(first, name) if value is None else float(value) for name, value in given.items()
-    }
+    header = {name: angle_of(first, name) for name, value in given.items() if value is None}
+    numbers = {name: header[name] if value is None else float(value) for name, value in given.items()}
     missing = [name for name, value in numbers.items() if value is None]
     if missing and (from_wcs := centre_of(first.header)) is not None:
         numbers |= {name: from_wcs[name] for name in missing}

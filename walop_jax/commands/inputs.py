@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 
 GIGABYTE = 1e9
-# --------------------------------------------------------------------------------------------------- options
-
 SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
 Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
 ModelLike = Annotated[
@@ -55,9 +53,6 @@ SetFile = Annotated[
 TableFile = Annotated[
     "PathLike | None", Option("Table to write (.fits, .csv, .ecsv).", "OUT", Path, "-o", required=True)
 ]
-
-
-# ---------------------------------------------------------------------------------------------------- reading
 
 
 def read(
@@ -164,9 +159,7 @@ def set_and_model(
         text = read_text(path_of(model, "a model", "base_model(calset), or the path of a model file"))
     if output is not None:
         if isinstance(model, Model) or isinstance(instrument, Instrument):
-            raise ValueError(
-                "with output, give model and instrument as files, so that the run can be made again"
-            )
+            raise ValueError("with output, give model and instrument as files: then it can be made again")
         paths_of(data)
     design = design_of(instrument)
     calset = set_of(data, design)
@@ -185,10 +178,7 @@ def set_and_model(
 def save(
     result: FitResult | Calibration | Run, folder: str | os.PathLike[str], *, overwrite: bool = False
 ) -> None:
-    """Write a fit as the folder of a run: calibration.fits and summary.json; of a calibration the first alone.
-
-    Raises `DataError` where they exist already and `overwrite` is False.
-    """
+    """Write a fit as the folder of a run, a calibration as its file alone. Raises `DataError` where they exist."""
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary

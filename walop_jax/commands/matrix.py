@@ -20,7 +20,6 @@ from walop_jax.commands.products import (
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming, fail, nearest
 
-POINTS = Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)
 OUT = Option("Table to write (.fits, .csv, .ecsv); needed with --points.", "OUT", Path, "-o")
 
 
@@ -31,7 +30,7 @@ def matrix(
     x: Annotated[Any, Option("One field point: X (deg).", kind=float)] = None,
     y: Annotated[Any, Option("The same: Y (deg).", kind=float)] = None,
     *,
-    points: Annotated[Any, POINTS] = None,
+    points: Annotated[Any, Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)] = None,
     output: Annotated[PathLike | None, OUT] = None,
     posterior: Posterior = None,
     effects: Effects = None,

@@ -43,9 +43,8 @@ class ModelFile(Displayed):
     def display(self) -> Display:
         """Its file and its size."""
         where = self.model.name if self.path is None else self.path
-        return Display(
-            f"{where}: {len(self.model.parameters)} parameters, {len(self.model.free)} of them free"
-        )
+        parameters, free = len(self.model.parameters), len(self.model.free)
+        return Display(f"{where}: {parameters} parameters, {free} of them free")
 
 
 @command(writes="file")

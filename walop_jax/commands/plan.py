@@ -137,9 +137,8 @@ def plan(
             for prefix in prior.design.moving()
             if prefix != CALIBRATION_PLATE
         }
-        available = ObservingPlan(
-            prior.design if prior.design.description else prior.instrument, moving=moving
-        )
+        design = prior.design if prior.design.description else prior.instrument
+        available = ObservingPlan(design, moving=moving)
     chosen = (
         read_input_table(criterion)
         if Path(str(criterion)).suffix and Path(str(criterion)).exists()

@@ -90,10 +90,7 @@ def fit_of(given: Any) -> Any:
 
 
 def calibration_of(given: Product, effects: Effects = None) -> Calibration:
-    """A calibration: as given, that of a fit or a diagnosis, or that of a product or run, read from its file.
-
-    Raises `DataError` for a file that cannot be read.
-    """
+    """A calibration as given, of a fit or a diagnosis, or read from a product or run (`DataError` if it cannot be)."""
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.product import read_calibration
 

@@ -89,9 +89,8 @@ class _OneCommand(TyperCommand):
             return super().parse_args(ctx, args)
         except Exception as error:
             if str(getattr(error, "option_name", "")).startswith(("-o", "--out")):
-                raise typer.BadParameter(
-                    f"{ctx.info_name} {self.advice}", ctx, param_hint="--output"
-                ) from None
+                complaint = f"{ctx.info_name} {self.advice}"
+                raise typer.BadParameter(complaint, ctx, param_hint="--output") from None
             raise
 
 
@@ -188,10 +187,7 @@ def _function(command: Command[Any]) -> Callable[..., None]:
 
 
 def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
-    """Run a command, with every error turned into one line on stderr and an exit code.
-
-    With the environment variable WALOP_JAX_DEBUG set, errors keep their traceback.
-    """
+    """Run a command; errors become a line on stderr and an exit code (with WALOP_JAX_DEBUG set: their traceback)."""
     try:
         with interrupts_answered(_interrupted):
             _run(command, given)

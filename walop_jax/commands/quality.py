@@ -68,9 +68,8 @@ def quality(
         accuracy = documents.get("summary", {}).get("accuracy_of_p")
         rows.append(quality_row(held, str(folder or held.path), accuracy))
         if rows[-1]["NIGHTS"] > 1:
-            remarks.append(
-                f"{rows[-1]['RUN']}: holds {rows[-1]['NIGHTS']} nights, its row is that of the last"
-            )
+            nights = f"{rows[-1]['NIGHTS']} nights"
+            remarks.append(f"{rows[-1]['RUN']}: holds {nights}, its row is that of the last")
     job.begin("writing")
     new = table_of_nights(rows)
     table, table_remarks = append(output, new, allowed)

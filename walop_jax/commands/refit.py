@@ -69,10 +69,10 @@ def refit(
     15.6675 ± 0.0051
     """
     from walop_jax import Calibration
+    from walop_jax.calibration.accuracy import GOAL
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.calibration.summary import summary
-    from walop_jax.calibration.thresholds import GOAL
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe

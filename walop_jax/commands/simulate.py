@@ -102,9 +102,8 @@ def simulate(
         template, catalogue = None, catalogue_of(effects)
         if like is not None:
             if instrument is not None or catalogue_seed is not None:
-                raise ValueError(
-                    "like gives instrument and catalogue: leave out instrument and catalogue_seed"
-                )
+                what = "like gives instrument and catalogue"
+                raise ValueError(f"{what}: leave out instrument and catalogue_seed")
             template = _template(like, catalogue)
             plan = template.planned(plan)
         plan = plan or ObservingPlan.usual(design_of(instrument) or nominal_instrument())

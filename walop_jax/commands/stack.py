@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
 LAWS = Option("Model file with [law] tables (default: that of the first fit).", "MODEL.toml", Path)
 LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
-EVENTS = Option("Table of works on the instrument: MJD, WHAT.", "TABLE", Path)
-KNOWN = Option("Do not look for breaks.")
 WORKERS = Option("Make nights in so many processes of this machine, by Dask.", "N", int, least=1)
 SCHEDULER = Option("Make nights on the workers of a Dask cluster that share the files.", "ADDRESS", str)
 SURVEY = Option("Folder of the survey.", "SURVEY", Path, "-o", required=True)
@@ -30,8 +28,8 @@ def stack(
     laws: Annotated[Any, LAWS] = None,
     *,
     like: Annotated[OptionalProduct, LIKE] = None,
-    events: Annotated[Any, EVENTS] = None,
-    no_breaks: Annotated[bool, KNOWN] = False,
+    events: Annotated[Any, Option("Table of works on the instrument: MJD, WHAT.", "TABLE", Path)] = None,
+    no_breaks: Annotated[bool, Option("Do not look for breaks.")] = False,
     workers: Annotated[int | None, WORKERS] = None,
     scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
     output: Annotated[Any, SURVEY] = None,
@@ -64,9 +62,7 @@ def stack(
     from walop_jax.nights.stacking import stack as stacked
 
     if workers is not None and scheduler is not None:
-        raise UsageError(
-            "workers and scheduler exclude each other: a cluster has its own workers", "scheduler"
-        )
+        raise UsageError("workers and scheduler exclude each other: a cluster has workers", "scheduler")
     sources = [fit_of(night) for night in several(nights)]
     with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
         job.begin("reading")

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from walop_jax.model.trace import Traced
 
 PRODUCT = Argument("An instrument as fitted; without it, as designed.", "[RUN/calibration.fits]", Path)
-ANGLE = Option("Polariser in, with its axis here (deg).", kind=float)
 
 
 @command()
@@ -41,7 +40,7 @@ def trace(
     y: Annotated[float, Option("Field position Y (deg).")] = 0.0,
     q: Annotated[float, Option("Stokes q of the source, a fraction.")] = 0.0,
     u: Annotated[float, Option("Stokes u of the source, a fraction.")] = 0.0,
-    angle: Annotated[float | None, ANGLE] = None,
+    angle: Annotated[float | None, Option("Polariser in, with its axis here (deg).", kind=float)] = None,
     at: Angles = None,
     teff: Annotated[float | None, TEFF] = None,
     filter: Annotated[str, FILTER] = "SDSS-r",

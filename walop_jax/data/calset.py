@@ -75,18 +75,14 @@ def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] 
     """
     if not paths:
         raise fail("no file was given", advice="name at least one calibration set")
-    sets: list[CalibrationSet] = []
+    sets: dict[str, CalibrationSet] = {}
     for path in paths:
         calset = _read_one(Path(path), kinds)
-        path_of = {entry.inputs[0].sha256: entry.inputs[0].path for entry in sets}
-        if calset.inputs[0].sha256 in path_of:
-            raise fail(
-                f"has the same bytes as {path_of[calset.inputs[0].sha256]}",
-                file=path,
-                advice="name each file once: repeated data would shrink the errors",
-            )
-        sets.append(calset)
-    return sets[0] if len(sets) == 1 else merge_calibration_sets(*sets)
+        if (same := sets.setdefault(calset.inputs[0].sha256, calset)) is not calset:
+            advice = "name each file once: repeated data would shrink the errors"
+            raise fail(f"has the same bytes as {same.inputs[0].path}", file=path, advice=advice)
+    calsets = tuple(sets.values())
+    return calsets[0] if len(calsets) == 1 else merge_calibration_sets(*calsets)
 
 
 def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
@@ -173,10 +169,15 @@ def assembled(
         check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
         intensities, odd = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
-        remarks += odd + repeated + _idle(intensities, exposures, path)
+        remarks += odd + repeated
+        idle = np.setdiff1d(np.arange(len(exposures)), intensities.exposure[intensities.used])
+        if len(idle):
+            names = ", ".join(map(str, exposures.exposure[idle][:5])) + (" …" if len(idle) > 5 else "")
+            remarks.append(f"{path} [INTENSITIES]: no used row for exposure(s) {names}")
     remarks += repeated_counts(intensities, exposures, points, path, compression)
     if compression is not None:
         remarks.append(remark(compression, len(points)))
+    used = np.unique(exposures.filter).tolist()
     return CalibrationSet(
         instrument=instrument,
         site=site,
@@ -184,7 +185,7 @@ def assembled(
         exposures=exposures,
         points=points,
         sources=sources,
-        filters=with_builtins(filters, exposures),
+        filters=filters | {name: builtin_filter(name) for name in sorted(set(used) - set(filters))},
         intensities=intensities,
         remarks=tuple(remarks),
         compression=compression,
@@ -195,26 +196,21 @@ def _header(header: Any, path: Path) -> tuple[str, Site]:
     place = Place(path, "PRIMARY")
     version = header.get("CALVERS")
     if version is None:
-        what = "a calibration product of a fit" if "PRODVERS" in header else "a calibration set"
-        advice = (
-            f"this is {what}: give the set that it was made from"
-            if "PRODVERS" in header
-            else f"is this {what}?"
-        )
+        advice = "is this a calibration set?"
+        if "PRODVERS" in header:
+            advice = "this is a calibration product of a fit: give the set that it was made from"
         raise place.fail("is missing", "CALVERS", advice)
     if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
         what = f"is {version!r}, this program reads up to {CALVERS}"
         raise place.fail(what, "CALVERS", "use a newer walop-jax")
     instrument = instrument_name(header.get("INSTRUME", ""), place)
-    values: dict[str, float] = {}
+    values: list[float] = []
     for name in ("SITELAT", "SITELONG", "SITEELEV"):
-        value = header.get(name, float("nan"))
+        value = header.get(name, _NAN)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise place.fail(f"is {value!r}, not a number", name, "degrees (east positive) and metres")
-        values[name] = float(value)
-    telescope = str(header.get("TELESCOP", "")).strip()
-    site = Site(telescope, values["SITELAT"], values["SITELONG"], values["SITEELEV"])
-    return instrument, site
+        values.append(float(value))
+    return instrument, Site(str(header.get("TELESCOP", "")).strip(), *values)
 
 
 def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -239,18 +235,6 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
     return tables, images
 
 
-def with_builtins(filters: dict[str, FilterCurve], exposures: Exposures) -> dict[str, FilterCurve]:
-    """Add the built-in curves that the exposures name and the file does not bring; a file's own win."""
-    absent = {str(name) for name in exposures.filter} - set(filters)
-    return filters | {name: builtin_filter(name) for name in sorted(absent)}
-
-
-def _idle(intensities: TableIntensities, exposures: Exposures, path: Path) -> list[str]:
-    idle = np.setdiff1d(np.arange(len(exposures)), intensities.exposure[intensities.used])
-    names = ", ".join(str(entry) for entry in exposures.exposure[idle][:5]) + (" …" if len(idle) > 5 else "")
-    return [f"{path} [INTENSITIES]: no used row for exposure(s) {names}"] if len(idle) else []
-
-
 def _frames(
     images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
 ) -> tuple[Intensities, Points]:
@@ -262,10 +246,8 @@ def _frames(
     grid, stack = frame_stack(images, len(exposures), path)
     check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
     width, total = grid.width, grid.pixels
-    corners = (0, width - 1, total - width, total - 1)
-    x, y = (
-        np.concatenate(coordinates) for coordinates in zip(*(grid.xy(n, n + 1) for n in corners), strict=True)
-    )
+    corners = [grid.xy(n, n + 1) for n in (0, width - 1, total - width, total - 1)]
+    x, y = (np.concatenate(coordinates) for coordinates in zip(*corners, strict=True))
     make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))
     place, last = Place(path, "N0"), intensities.cameras - 1
@@ -281,11 +263,8 @@ def _frames(
             values = counts[used]
             lowest, highest = min(lowest, values.min()), max(highest, values.max())
     if spoilt > 0.2 * number:
-        raise place.fail(
-            f"{100 * spoilt / number:.0f} % of the pixels looked at are not finite or far below zero",
-            f"N0…N{last}, E0…E{last}",
-            "repair the reduction, or set the FLAG image",
-        )
+        what = f"{100 * spoilt / number:.0f} % of the pixels looked at are not finite or far below zero"
+        raise place.fail(what, f"N0…N{last}, E0…E{last}", "repair the reduction, or set the FLAG image")
     if lowest == highest and number > 1:
         raise place.fail(f"all counts are equal ({lowest:g})", f"N0…N{last}", "these are not measurements")
     return intensities, grid.points
@@ -338,22 +317,17 @@ def from_arrays(
     counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
     x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
-        raise fail(
-            f"has shape {counts.shape} for {len(x)} values of x, {len(y)} of y and {len(angles)} angles",
-            column="counts",
-            advice="its axes are (point, exposure, camera)",
-        )
+        what = f"has shape {counts.shape} for {len(x)} values of x, {len(y)} of y and {len(angles)} angles"
+        raise fail(what, column="counts", advice="its axes are (point, exposure, camera)")
     for name, curve in (filters or {}).items():
         if not isinstance(curve, FilterCurve):
-            raise fail(
-                f"{name!r} is no curve",
-                column="filters",
-                advice=f"give walop.FilterCurve({name!r}, wavelength in um, throughput)",
-            )
+            advice = f"give walop.FilterCurve({name!r}, wavelength in um, throughput)"
+            raise fail(f"{name!r} is no curve", column="filters", advice=advice)
     if errors.shape != counts.shape:
         raise fail(f"has shape {errors.shape}, counts {counts.shape}", column="errors", advice="one for each")
     number, inside = len(angles), np.isfinite(angles)
-    point, exposure = np.nonzero(np.isfinite(counts).all(axis=2))
+    at = point, exposure = np.nonzero(np.isfinite(counts).all(axis=2))
+    of_star, masked = without_mask(np.full(counts.shape[:2], -1) if source is None else source)
     tables: dict[str, Mapping[str, Any]] = {
         "EXPOSURES": {
             "EXPOSURE": np.arange(number),
@@ -366,42 +340,27 @@ def from_arrays(
         "INTENSITIES": {
             "EXPOSURE": exposure,
             "POINT": point,
-            "SOURCE": np.full(len(point), -1)
-            if source is None
-            else _none_where_masked(source)[point, exposure],
-            "N": counts[point, exposure],
-            "N_ERR": errors[point, exposure],
+            "SOURCE": np.where(masked, -1, of_star)[at],
+            "N": counts[at],
+            "N_ERR": errors[at],
         },
     }
     if sky is not None:
         level = np.broadcast_to(in_unit(sky, "electron", "sky"), counts.shape)
-        tables["INTENSITIES"] = {**tables["INTENSITIES"], "SKY": level[point, exposure]}
+        tables["INTENSITIES"] = {**tables["INTENSITIES"], "SKY": level[at]}
     if sources is not None:
         tables["SOURCES"] = _sources(sources)
     if filters:
         tables["FILTERS"] = filter_columns(filters)
-    calset = _in_memory(
-        tables,
-        instrument=instrument,
-        site=Site("", _NAN, _NAN, _NAN) if site is None else site,
-        origin=origin,
-    )
+    site = site or Site("", _NAN, _NAN, _NAN)
+    calset = _in_memory(tables, instrument=instrument, site=site, origin=origin)
     return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
-    """A set from memory behind the checks that files meet, and as they would leave it: unusable rows masked, and said.
-
-    `kinds` are kinds of exposures beyond those of the format. Raises `DataError` as `read_calibration_set` does.
-    """
-    found = _in_memory(
-        set_tables(calset),
-        instrument=calset.instrument,
-        site=calset.site,
-        origin=calset.origin,
-        kinds=(*KINDS, *kinds),
-        compression=calset.compression,
-    )
+    """A set from memory behind the checks that files meet; unusable rows are masked, and remarked on."""
+    header = {name: getattr(calset, name) for name in ("instrument", "site", "origin", "compression")}
+    found = _in_memory(set_tables(calset), **header, kinds=(*KINDS, *kinds))
     before, after = calset.intensities, found.intensities
     if isinstance(before, TableIntensities) and isinstance(after, TableIntensities):
         # A file says why a row is not to be used, memory only that it is not.
@@ -423,10 +382,8 @@ def _spoilt(counts: np.ndarray) -> Iterator[str]:
     finite = np.isfinite(counts)
     places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
     if len(places):
-        shown = ", ".join(
-            f"counts[{p}, {e}] (camera {' and '.join(str(k) for k in np.flatnonzero(~finite[p, e]))})"
-            for p, e in places[:_SHOWN].tolist()
-        )
+        cameras = {(p, e): map(str, np.flatnonzero(~finite[p, e])) for p, e in places[:_SHOWN].tolist()}
+        shown = ", ".join(f"counts[{p}, {e}] (camera {' and '.join(k)})" for (p, e), k in cameras.items())
         suffix = f" and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
         yield f"{NAME}: not finite in {shown}{suffix}: not used in any camera"
 
@@ -441,11 +398,6 @@ def _spread(name: str, values: Any, number: int) -> Any:
     if plain.dtype.kind in "bSU":
         Place(NAME, "EXPOSURES").refuse(masked, "is masked", name.lower(), "fill or remove these")
     return spread
-
-
-def _none_where_masked(source: Any) -> np.ndarray:
-    values, masked = without_mask(source)
-    return np.where(masked, -1, values)
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, Any]:

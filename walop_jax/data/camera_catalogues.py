@@ -7,6 +7,7 @@ of the flags. A quantity with several columns is read from the first one that th
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -106,10 +107,7 @@ class CameraCatalogue:
 
 
 def read_map(source: str | os.PathLike[str]) -> ColumnMap:
-    """A map of columns: one that comes with the package, by name, or a TOML file.
-
-    Raises `DataError` naming the key that is wrong.
-    """
+    """A map of columns that comes with the package, by name, or of a TOML file; `DataError` names a wrong key."""
     shipped = str(source) in SHIPPED
     text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
     with errors_naming(source):
@@ -160,9 +158,7 @@ def read_camera_catalogue(
     flag = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
     of_stars = {name: column_of_stars(source, name) for name in OF_STARS if name in source.names}
-    of_exposure = {
-        name: value for name in OF_EXPOSURES if (value := _of_all(source, stated, name, place)) is not None
-    }
+    of_exposure = {name: _of_all(source, stated, name, place) for name in OF_EXPOSURES}
     if bad.any():
         what = "fluxes are not finite, or have no error above 0: not used"
         source.remarks.append(f"{int(bad.sum())} of {len(bad)} {what}")
@@ -181,7 +177,7 @@ def read_camera_catalogue(
         sky=None if level is None else factor * _plain_numbers(source, level, place)[rows],
         flag=np.where(bad, flag | BAD_PIXEL, flag)[rows],
         of_stars={name: values[rows] for name, values in of_stars.items()},
-        of_exposure=of_exposure,
+        of_exposure={name: value for name, value in of_exposure.items() if value is not None},
         pointing={name: stated.get(name) for name in POINTING},
         header=header,
         remarks=(*source.remarks, *source.hints({"TEFF", "SOURCE_ID", "N_FLAG"})),
@@ -237,18 +233,13 @@ def _one(source: InputTable, name: str, place: Place) -> Any:
 
 def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exception:
     """The error for a catalogue without fluxes: magnitudes, or names that no map has."""
-    magnitudes = [
-        name
-        for name in source.names
-        if any(name in map(str.upper, column_map.magnitude) for column_map in maps)
-    ]
+    of_maps = {name.upper() for column_map in maps for name in column_map.magnitude}
+    magnitudes = [name for name in source.names if name in of_maps]
     if magnitudes or any(unit_of(source.table[name]) == "mag" for name in source.table.colnames):
         listed = some(magnitudes or list(source.names), 4)
         advice = f"write {maps[0].flux[0][0]} and {maps[0].flux[0][1]} as well: intensities add up, magnitudes do not"
         return place.fail(f"has magnitudes and no fluxes with errors ({listed})", "", advice)
-    expected = " or ".join(
-        f"{column_map.flux[0][0]}, {column_map.flux[0][1]} of {column_map.program}" for column_map in maps
-    )
+    expected = " or ".join(f"{', '.join(m.flux[0])} of {m.program}" for m in maps)
     lone = [pair[0] for column_map in maps for pair in column_map.flux if pair[0].upper() in source.names]
     what = f"has {lone[0]} without its error" if lone else f"has no fluxes with errors, such as {expected}"
     advice = "name the columns of another program in a TOML file: --columns FILE.toml (walop-jax docs files)"
@@ -268,21 +259,18 @@ def _fluxes(
     if counts != of_error:
         what = f"is in {given[1]}, {names[0]} in {given[0]}"
         raise place.fail(what, _plain(names[1])[0], "give both in counts, or both in electrons")
+    wanted = "ct" if counts else "electron"
     flux, error = (
-        convert_unit(
-            _plain_numbers(source, name, place), unit, "ct" if counts else "electron", _plain(name)[0], place
-        )
+        convert_unit(_plain_numbers(source, name, place), unit, wanted, _plain(name)[0], place)
         for name, unit in zip(names, plain, strict=True)
     )
     measured = np.isfinite(flux) & np.isfinite(error) & (error > 0)
     if not measured.any():
         what, advice = "has no flux with an error above 0", "give standard errors of the fluxes"
         raise place.fail(what, _plain(names[1])[0], advice)
-    if (
-        np.abs(flux[measured]).max() < _FAINTEST_MAGNITUDE
-        and np.median(error[measured] - 0.1 * np.abs(flux[measured])) < 0.0
-    ):
-        low, high, typical = flux[measured].min(), flux[measured].max(), np.median(error[measured])
+    size, errors = np.abs(flux[measured]), error[measured]
+    if size.max() < _FAINTEST_MAGNITUDE and np.median(errors - 0.1 * size) < 0.0:
+        low, high, typical = flux[measured].min(), flux[measured].max(), np.median(errors)
         what = f"lies between {low:.3g} and {high:.3g} with errors of {typical:.2g}: these are magnitudes"
         raise place.fail(what, _plain(names[0])[0], "name a column of fluxes")
     if counts and gain is None:
@@ -370,15 +358,11 @@ def angle_of(catalogue: CameraCatalogue, name: str) -> float | None:
     value = catalogue.pointing[name]
     if value is None or isinstance(value, bool) or value == "":
         return None
-    try:
-        return float(value)
-    except ValueError:
-        pass
-    try:
-        return float(degrees_of(str(value), "hourangle" if name == "RA" else "deg"))
-    except ValueError:
-        advice = f"give --{name.lower()} (deg) to walop-jax gather, or the word that holds it (--words)"
-        raise Place(catalogue.path, "header").fail(f"{value!r} is no angle", name, advice) from None
+    for angle in (float, lambda text: float(degrees_of(str(text), "hourangle" if name == "RA" else "deg"))):
+        with contextlib.suppress(ValueError):
+            return angle(value)
+    advice = f"give --{name.lower()} (deg) to walop-jax gather, or the word that holds it (--words)"
+    raise Place(catalogue.path, "header").fail(f"{value!r} is no angle", name, advice)
 
 
 def centre_of(header: Mapping[str, Any]) -> dict[str, float] | None:

@@ -90,10 +90,7 @@ def checked_curve(
     place: Place,
     where: str = "",
 ) -> FilterCurve:
-    """The curve of a filter (µm), its NaN padding stripped, turned round where it descends.
-
-    Raises `DataError`, naming `place` and `where` in it, for a curve that no filter has.
-    """
+    """The curve of a filter (µm), padding stripped, ascending; `DataError`, at `place`, for one that no filter has."""
 
     def refuse(bad: Any, what: str, column: str, advice: str) -> None:
         if bad:
@@ -119,10 +116,7 @@ def checked_curve(
 def make_sources(
     table: dict[str, Any], place: Place, filters: Mapping[str, FilterCurve] | None = None
 ) -> Sources:
-    """Check the SOURCES table (fractions; kelvin): one row for a star, or one for each of its bands (FILTER).
-
-    A band is one of `filters`, built in, or photometric.
-    """
+    """Check the SOURCES table: one row for a star, or one for each of its bands (`filters`, built in, photometric)."""
     check(table, SOURCES, place)
     sources = Sources(**{name.lower(): table[name] for name in SOURCES})
     bands = {*(filters or ()), *BUILTIN_FILTERS, *PHOTOMETRIC_BANDS}
@@ -150,10 +144,7 @@ def make_exposures(
     place: Place,
     kinds: Collection[str] | None = KINDS.keys(),
 ) -> Exposures:
-    """Check the EXPOSURES table (degrees, days, kelvin, …) for the columns that every KIND needs.
-
-    `kinds` are those that KIND may have, None: any.
-    """
+    """Check the EXPOSURES table for the columns that every KIND needs; `kinds` are those allowed, None: any."""
     table["KIND"] = kind = np.char.lower(table["KIND"])
     for name in np.unique(kind).tolist():
         if kinds is not None and name not in kinds:
@@ -179,11 +170,9 @@ def make_exposures(
         advice = "take it at several angles; only elements behind it may turn during an exposure"
         place.refuse(turning[POLARISER], "is not 0", f"{POLARISER}_TURN", advice)
     several = np.sum([*turning.values(), np.zeros(len(kind))], axis=0) > 1
-    what, advice = (
-        "another element turns as well",
-        "one at a time: their angles go together, which is not stated",
-    )
-    place.refuse(several, what, " and ".join(f"{p}_TURN" for p in turning), advice)
+    column = " and ".join(f"{p}_TURN" for p in turning)
+    advice = "one at a time: their angles go together, which is not stated"
+    place.refuse(several, "another element turns as well", column, advice)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
     if like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
@@ -191,12 +180,11 @@ def make_exposures(
     angles_of = {f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}
     check(table, {**EXPOSURES, **angles_of, **{f"{prefix}_TURN": TURN for prefix in turning}}, place)
 
-    moon, standard = (kind == "moon") & ~clp_in, (kind == "standard") & ~clp_in
-    for name in ("MJD", "RA", "DEC", "ROTATOR"):
-        bad = moon & ~np.isfinite(table[name])
-        place.refuse(bad, "is not finite", name, "the moonlit sky needs time and pointing")
-    bad = standard & ~np.isfinite(table["ROTATOR"])
-    place.refuse(bad, "is not finite", "ROTATOR", "a standard needs it")
+    moon, standard = ((kind == name) & ~clp_in for name in ("moon", "standard"))
+    pointing = ("MJD", "RA", "DEC", "ROTATOR")
+    needs = [(moon, name, "the moonlit sky needs time and pointing") for name in pointing]
+    for needing, name, advice in (*needs, (standard, "ROTATOR", "a standard needs it")):
+        place.refuse(needing & ~np.isfinite(table[name]), "is not finite", name, advice)
     low, high = EPHEMERIS_MJD
     bad = (moon & (table["MJD"] < low)) | (table["MJD"] > high)
     place.refuse(bad, "is not in 1900 … 2100", "MJD", "is this a Julian Date? subtract 2400000.5")
@@ -212,9 +200,8 @@ def _site(site: Site, place: Place, *, needed: bool) -> None:
     }
     for name, (value, low, high) in values.items():
         if not low <= value <= high and (needed or not np.isnan(value)):
-            raise Place(place.file, "PRIMARY").fail(
-                f"is {value:g}, not in {low:g} … {high:g}", name, "the Moon's parallax needs the site"
-            )
+            what = f"is {value:g}, not in {low:g} … {high:g}"
+            raise Place(place.file, "PRIMARY").fail(what, name, "the Moon's parallax needs the site")
 
 
 def like_radians(angles: np.ndarray) -> bool:
@@ -255,10 +242,8 @@ def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place
         yield f"{where}: is before 1990 in {rows_text(dated[old])}; write NaN where the time is not known"
     middle = np.median(mjd)
     if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
-        yield (
-            f"{where}: is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(dated[far])}; "
-            "correct it, or calibrate the epochs one by one"
-        )
+        what = f"is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(dated[far])}"
+        yield f"{where}: {what}; correct it, or calibrate the epochs one by one"
 
 
 def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
@@ -272,7 +257,5 @@ def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:
         if card == "SITELONG":
             away = abs((away + 180.0) % 360.0 - 180.0)
         if np.isfinite(away) and away > near:
-            yield (
-                f"{place.file} [PRIMARY] {card}: is {value:g}{unit}, {instrument} stands at {described_value:g}{unit}; "
-                "correct the card if the instrument has not been moved"
-            )
+            what = f"{card}: is {value:g}{unit}, {instrument} stands at {described_value:g}{unit}"
+            yield f"{place.file} [PRIMARY] {what}; correct the card if the instrument has not been moved"

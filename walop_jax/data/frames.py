@@ -45,10 +45,7 @@ class Cube:
     stamp: tuple[int, int]
 
     def stored(self, start: int, stop: int) -> np.ndarray:
-        """Some rows of all planes as they lie in the file, mapped and not yet read.
-
-        Raises `DataError` if the file has gone or changed since it was checked.
-        """
+        """Some rows of all planes as in the file, mapped; `DataError` if that has gone or changed meanwhile."""
         self._check_stamp()
         try:
             # Mapped anew each time: no open file to keep, and pages are given back after the slab.
@@ -58,10 +55,7 @@ class Cube:
         return np.asarray(raw[:, start:stop])
 
     def read_into(self, planes: np.ndarray, start: int) -> None:
-        """Read the bytes of some rows of all planes, from row `start` on, into an array (plane, row, column).
-
-        Rows of the array must lie side by side. Raises what `stored` raises.
-        """
+        """Read rows of all planes, from `start` on, into an array (plane, row, column) without gaps."""
         self._check_stamp()
         _, height, width = self.shape
         row = width * self.dtype.itemsize
@@ -81,10 +75,7 @@ class Cube:
             raise fail("the file has changed since it was opened", file=self.path, advice="read it again")
 
     def rows(self, start: int, stop: int) -> Float[np.ndarray, "e y x"]:
-        """Read some rows of all planes; undefined integers (BLANK) become NaN.
-
-        Raises what `stored` raises.
-        """
+        """Read some rows of all planes; undefined integers (BLANK) become NaN. Raises what `stored` raises."""
         stored = self.stored(start, stop)
         values = stored.astype(np.float64)
         if (self.scale, self.zero) != (1.0, 0.0):
@@ -137,10 +128,7 @@ class FrameIntensities(Intensities):
         return sum(int(np.count_nonzero(self.block(start, start + step).used)) for start in starts)
 
     def block(self, start: int, stop: int) -> Block:
-        """Return the data of the pixels `start:stop`, dense in the exposures.
-
-        Raises `DataError` for an error that is zero or negative on an unflagged pixel.
-        """
+        """The pixels `start:stop`, dense in the exposures; `DataError` for an error not above zero on an open pixel."""
         start, stop, _ = slice(start, stop).indices(self.grid.pixels)
         stop = max(start, stop)
         block = empty_block(*self.grid.xy(start, stop), self.exposures, self.cameras)
@@ -172,8 +160,7 @@ class FrameIntensities(Intensities):
             values = cube.rows(top, bottom)
             return values.reshape(len(values), -1)[:, inside].T
 
-        counts = np.stack([columns(cube) for cube in stack.counts], axis=-1)
-        sigma = np.stack([columns(cube) for cube in stack.sigma], axis=-1)
+        counts, sigma = (np.stack(list(map(columns, s)), axis=-1) for s in (stack.counts, stack.sigma))
         if stack.flag is None:
             return counts, sigma, np.zeros(counts.shape[:2], dtype=np.int64)
         # An undefined flag is no clean bill of health.
@@ -207,32 +194,26 @@ def frame_stack(images: Mapping[str, Any], exposures: int, path: Path) -> tuple[
     check_units(units, "electron", Place(path, "BUNIT"))
     if len(grids) > 1:
         reference, second, *_ = grids.values()
-        raise fail(
-            f"{reference} and {second} do not lie on the same grid", file=path, advice="resample them first"
-        )
-    grid = next(iter(grids))
-    flag = cubes.get("FLAG")
+        what = f"{reference} and {second} do not lie on the same grid"
+        raise fail(what, file=path, advice="resample them first")
+    grid, flag = next(iter(grids)), cubes.get("FLAG")
     if flag is not None and flag.shape[1:] != (grid.height, grid.width):
         raise fail("does not have the shape of N0", file=path, extension="FLAG", advice="write it anew")
-    return grid, FrameStack(
-        exposures, tuple(cubes[name] for name in counts), tuple(cubes[name] for name in errors), flag
-    )
+    cubes_of, sigma_of = (tuple(cubes[name] for name in names) for names in (counts, errors))
+    return grid, FrameStack(exposures, cubes_of, sigma_of, flag)
 
 
 def _cube(hdu: Any, exposures: int, place: Place) -> Cube:
     header = hdu.header
     if "ZIMAGE" in header:
-        raise place.fail(
-            "is compressed tile by tile", advice="unpack it with funpack: frames are read in slabs"
-        )
+        advice = "unpack it with funpack: frames are read in slabs"
+        raise place.fail("is compressed tile by tile", advice=advice)
     shape = tuple(int(header[f"NAXIS{n}"]) for n in range(int(header["NAXIS"]), 0, -1))
     shape = (1, *shape) if len(shape) == 2 else shape
     planes = (exposures, 1) if place.extension == "FLAG" else (exposures,)
     if len(shape) != 3 or shape[0] not in planes or 0 in shape:
-        raise place.fail(
-            f"has shape {shape} where ({exposures}, ny, nx) is needed",
-            advice="one plane per row of EXPOSURES",
-        )
+        what = f"has shape {shape} where ({exposures}, ny, nx) is needed"
+        raise place.fail(what, advice="one plane per row of EXPOSURES")
     path = Path(str(place.file)).absolute()
     info, stat = hdu.fileinfo(), path.stat()
     kinds = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
@@ -288,10 +269,7 @@ class RowReader:
         self._own = threading.local()
 
     def __call__(self, start: int, stop: int) -> RawRows:
-        """The image rows `start:stop`.
-
-        Raises `DataError` if a file has gone or changed since it was checked.
-        """
+        """The image rows `start:stop`. Raises `DataError` if a file has gone or changed since it was checked."""
         counts, sigma, closed = self._buffers()
         inside = (slice(0, stop - start), slice(0, self.intensities.grid.width))
         closed[:] = True

@@ -51,30 +51,27 @@ def read_grid(header: Any, place: Place) -> Grid:
     for axis, name in ((1, "X"), (2, "Y")):
         axis_type = str(header.get(f"CTYPE{axis}", "")).strip().upper()
         if axis_type != name:
-            raise place.fail(
-                f"is {axis_type!r} where {name!r} is needed", f"CTYPE{axis}", "field coordinates, linear"
-            )
+            what = f"is {axis_type!r} where {name!r} is needed"
+            raise place.fail(what, f"CTYPE{axis}", "field coordinates, linear")
     if float(header.get("CROTA2", 0.0)) != 0.0:
         raise place.fail("is an obsolete rotation", "CROTA2", "write PC or CD")
+
+    def scale(n: int) -> float:
+        unit = str(header.get(f"CUNIT{n}") or "deg")
+        return float(convert_unit(np.ones(1), unit, "deg", f"CUNIT{n}", place)[0])
 
     def matrix(i: int, j: int) -> float:
         if any(f"CD{a}_{b}" in header for a in (1, 2) for b in (1, 2)):
             return float(header.get(f"CD{i}_{j}", 0.0))
         return float(header.get(f"CDELT{i}", 1.0)) * float(header.get(f"PC{i}_{j}", 1.0 if i == j else 0.0))
 
-    scale = [
-        float(convert_unit(np.ones(1), str(header.get(f"CUNIT{n}") or "deg"), "deg", f"CUNIT{n}", place)[0])
-        for n in (1, 2)
-    ]
+    x, y = scale(1), scale(2)
     grid = Grid(
         width=int(header["NAXIS1"]),
         height=int(header["NAXIS2"]),
         reference=(float(header.get("CRPIX1", 0.0)), float(header.get("CRPIX2", 0.0))),
-        value=(scale[0] * float(header.get("CRVAL1", 0.0)), scale[1] * float(header.get("CRVAL2", 0.0))),
-        matrix=(
-            (scale[0] * matrix(1, 1), scale[0] * matrix(1, 2)),
-            (scale[1] * matrix(2, 1), scale[1] * matrix(2, 2)),
-        ),
+        value=(x * float(header.get("CRVAL1", 0.0)), y * float(header.get("CRVAL2", 0.0))),
+        matrix=((x * matrix(1, 1), x * matrix(1, 2)), (y * matrix(2, 1), y * matrix(2, 2))),
     )
     if np.linalg.det(np.array(grid.matrix)) == 0 or not np.all(np.isfinite(grid.matrix)):
         raise place.fail("the coordinates are singular", "CDELT, PC, CD", "write the pixel scale in degrees")

@@ -43,10 +43,7 @@ def filter_columns(filters: Mapping[str, FilterCurve]) -> dict[str, np.ndarray]:
 def table_hdu(
     name: str, columns: Mapping[str, np.ndarray], path: object, rules: Mapping[str, schema.Column]
 ) -> fits.BinTableHDU:
-    """A binary table by its rules; columns that have a default may be left out.
-
-    Raises `DataError`, naming `path`, for text that is not plain ASCII.
-    """
+    """A binary table by its rules, columns with a default optional; `DataError`, at `path`, for text beyond ASCII."""
     made = []
     for column, rule in rules.items():
         if column not in columns and rule.missing is not None:

@@ -34,7 +34,10 @@ LONGEST = 100  # characters of a fact
 MJD_1970 = 40587.0
 TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
-_INSIDE = dict.fromkeys(("t", "true", "1", "in"), True) | dict.fromkeys(("f", "false", "0", "out"), False)
+_INSIDE: Mapping[str, bool] = {
+    **dict.fromkeys(("t", "true", "1", "in"), True),
+    **dict.fromkeys(("f", "false", "0", "out"), False),
+}
 _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.Pow: operator.pow, ast.Mod: operator.mod, ast.USub: operator.neg, ast.UAdd: operator.pos,
@@ -92,11 +95,11 @@ def words_of(content: Mapping[str, Any]) -> Words:
             table = {**table, "word": (single,)}
         columns[name] = word = Word(**read.values(of_word, table, name))
         if bool(word.word) == ("value" in table):
-            what = 'needs word = "…", a list of words of which the first is taken, or value = …'
-            raise read.fault(name, what)
+            raise read.fault(
+                name, 'needs word = "…", a list of words of which the first is taken, or value = …'
+            )
         if word.expression and (odd := _names(word.expression, read, name) - {"x", *content}):
-            what = f"expression: there is no {min(odd)!r}; {nearest(min(odd), content)}"
-            raise read.fault(name, what)
+            raise read.fault(name, f"expression: there is no {min(odd)!r}; {nearest(min(odd), content)}")
     top = read.values(tops, {key: value for key, value in content.items() if key in tops}, "")
     read.known(facts := top.get("schedule", {}), FACTS, "schedule")
     if (mode := facts.get("mode", MODES[0])) not in MODES:
@@ -196,9 +199,8 @@ def _records(path: Path, words: Words, content: Any) -> Iterator[Mapping[str, An
             raise fail(f"has no header to read: {error}", file=path, advice=advice) from error
         yield _plain(header)
     else:
-        _, table, _ = read_table_file(path, ())
-        for row in table:
-            yield {name: _unmasked(row[name]) for name in table.colnames}
+        table = read_table_file(path, ())[1]
+        yield from (dict(zip(table.colnames, row, strict=True)) for row in table.iterrows())
 
 
 def json_content(path: str | os.PathLike[str]) -> Any:
@@ -224,10 +226,6 @@ def _of_json(path: Path, rows: str, content: Any) -> Iterator[Mapping[str, Any]]
     yield from content
 
 
-def _unmasked(value: Any) -> Any:
-    return None if np.ma.is_masked(value) else value.item() if hasattr(value, "item") else value
-
-
 def _found(record: Mapping[str, Any], word: str) -> Any:
     """The value of a word, a path of words in nested records ("hwp.angle"); None where it is not there or empty."""
     value: Any = record
@@ -240,6 +238,9 @@ def _found(record: Mapping[str, Any], word: str) -> Any:
         value = value[key]  # of a document database: {"$date": {"$numberLong": milliseconds since 1970}}
         if key == "$date" and not isinstance(value, str):
             value = MJD_1970 + float(_found({"": value}, "")) / 86400e3
+    if np.ma.is_masked(value):
+        return None
+    value = getattr(value, "item", lambda: value)()  # of numpy
     empty = isinstance(value, float) and math.isnan(value)
     return None if empty or (isinstance(value, str) and value.strip().lower() in MISSING) else value
 
@@ -262,12 +263,10 @@ def _row(record: Mapping[str, Any], words: Mapping[str, Word], file: str) -> dic
             what = f"the word {listed} is {'empty' if empty else 'missing'}"
             raise place.fail(what, name, f"{like}optional = true where it may be absent")
         converted[name] = _value(value, name, rules[name], word, place)
-    return {
-        name: _evaluated(expression, {**converted, "x": value}, name, place)
-        if (expression := words[name].expression)
-        else value
-        for name, value in converted.items()
-    }
+    stated = {name: word.expression for name, word in words.items() if word.expression and name in converted}
+    operands = ({**converted, "x": converted[name]} for name in stated)
+    made = zip(stated, stated.values(), operands, strict=True)
+    return converted | {name: _evaluated(text, values, name, place) for name, text, values in made}
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:
@@ -282,11 +281,10 @@ def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any
     if rule.kind == "str":
         return _text(value)
     if rule.kind == "bool":
-        text = _text(value).lower()
-        if text not in _INSIDE:
+        if (inside := _INSIDE.get(_text(value).lower())) is None:
             advice = 'give its meaning: values = { "…" = true }'
             raise place.fail(f"{what} is neither true nor false", name, advice)
-        return _INSIDE[text]
+        return inside
     number = _number(value, name, rule, word, place, what)
     if rule.kind == "int":
         if number != round(number):
@@ -311,14 +309,13 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
         if with_unit:
             return value / 15.0 if rule.unit == "h" else value
         if not word.unit:
-            advice = 'give unit = "hourangle" or unit = "deg"'
-            raise place.fail(f"{what} may be hours or degrees", name, advice)
+            raise place.fail(
+                f"{what} may be hours or degrees", name, 'give unit = "hourangle" or unit = "deg"'
+            )
     if isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
-    number = float(value)
-    if not word.unit:
-        return number
-    return float(convert_unit(np.array([number]), word.unit, rule.unit, name, place)[0])
+    numbers = np.array([float(value)])
+    return float((convert_unit(numbers, word.unit, rule.unit, name, place) if word.unit else numbers)[0])
 
 
 def _text(value: Any) -> str:
@@ -341,8 +338,9 @@ def _names(expression: str, read: Reader, name: str) -> set[str]:
     for node in ast.walk(tree):
         number = not isinstance(node, ast.Constant) or type(node.value) in (int, float)
         if not isinstance(node, allowed) or not number:
-            what = f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
-            raise read.fault(name, what)
+            raise read.fault(
+                name, f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
+            )
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 

@@ -106,71 +106,57 @@ class Inspection(Displayed):
         counted = math.isfinite(self.median_counts)
         apart = "; standards are measured at places of their own" if self.sources else ""
         sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
-        place = (self.instrument, self.telescope)
+        place = ", ".join(filter(None, (self.instrument, self.telescope)))
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
+        counts = {use.prefix: (use.exposures, len(use.angles)) for use in self.elements}
+        uses = {f"element {p}": f"in {n} exposures, {angles} angles" for p, (n, angles) in counts.items()}
+        facts = {
+            "instrument": f"{place} ({self.origin or 'origin not stated'})",
+            "field points": f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
+            "cameras": str(self.cameras),
+            "polariser angles": f"{len(self.angles)} modulo 180°, widest gap {self.widest_gap:.3g}°",
+            **uses,
+            "used": f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
+            "flagged": ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none",
+            "median counts": f"{rounded(self.median_counts)} electrons" if counted else "none: all KIND flux",
+            "errors": noise if counted else "as stated",
+            "standards": ", ".join(self.sources) or "none",
+            "filters": ", ".join(self.filters),
+        }
+        rows = (
+            (
+                g.kind,
+                g.filter,
+                g.calibration_plate,
+                g.teff,
+                g.exposures,
+                g.angles or "",
+                f"{100 * g.used:.0f} %",
+            )
+            for g in self.groups
+        )
         return Display(
             title=", ".join(self.files) or "in memory",
-            facts=(
-                ("instrument", f"{', '.join(filter(None, place))} ({self.origin or 'origin not stated'})"),
-                (
-                    "field points",
-                    f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
-                ),
-                ("cameras", str(self.cameras)),
-                ("polariser angles", f"{len(self.angles)} modulo 180°, widest gap {self.widest_gap:.3g}°"),
-                *(
-                    (f"element {use.prefix}", f"in {use.exposures} exposures, {len(use.angles)} angles")
-                    for use in self.elements
-                ),
-                (
-                    "used",
-                    f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
-                ),
-                ("flagged", ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none"),
-                (
-                    "median counts",
-                    f"{rounded(self.median_counts)} electrons" if counted else "none: all KIND flux",
-                ),
-                ("errors", noise if counted else "as stated"),
-                ("standards", ", ".join(self.sources) or "none"),
-                ("filters", ", ".join(self.filters)),
-            ),
+            facts=tuple(facts.items()),
             head=("kind", "filter", "calibration plate", "source", ">exposures", ">angles", ">used"),
-            rows=tuple(
-                (
-                    group.kind,
-                    group.filter,
-                    group.calibration_plate,
-                    group.teff,
-                    str(group.exposures),
-                    str(group.angles) if group.angles else "",
-                    f"{100 * group.used:.0f} %",
-                )
-                for group in self.groups
-            ),
+            rows=tuple(tuple(map(str, row)) for row in rows),
             notes=tuple(f"{finding.severity} {finding}" for finding in self.findings)
             or ("nothing is wrong",),
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Sample:
-    points: int
-    used: np.ndarray  # (point, exposure)
-    counts: np.ndarray  # used rows that are not KIND flux
-    ratio: np.ndarray
-    by_camera: np.ndarray  # median of the ratio, camera by camera
-
-
 def inspect(calset: CalibrationSet) -> Inspection:
     """Look at a calibration set that has been read; of whole frames only at evenly spaced pixels."""
     e, points = calset.exposures, calset.points
-    sample = _sample(calset)
-    share = sample.used.mean(axis=0)
-    live = share > 0
+    _, block = sampled(calset.intensities, len(points), _LOOKED_AT)
+    used = block.used
+    share = used.mean(axis=0)
+    live, measured = share > 0, used & ~e.flux_known
+    counts, sigma = block.counts[measured], block.sigma[measured]
+    ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
+    by_camera = np.array([_median(of_camera) for of_camera in ratio.T])
     angles = np.unique(np.round(np.mod(e.clp_angle[e.clp_in & live], 180.0), 3))
     gaps = np.diff(np.append(angles, angles[:1] + 180.0))
-    ratio = float(np.median(sample.ratio)) if sample.ratio.size else float("nan")
     inspection = Inspection(
         instrument=calset.instrument,
         telescope=calset.site.telescope,
@@ -184,48 +170,33 @@ def inspect(calset: CalibrationSet) -> Inspection:
         angles=tuple(angles.tolist()),
         widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
         elements=tuple(_element_use(e, prefix, live) for prefix in e.further),
-        looked_at=sample.points,
-        rows=int(sample.used.sum()),
-        possible=int(sample.used.size),
+        looked_at=len(used),
+        rows=int(used.sum()),
+        possible=int(used.size),
         flags=_flags(calset),
-        median_counts=float(np.median(sample.counts)) if sample.counts.size else float("nan"),
-        noise_ratio=ratio,
+        median_counts=_median(counts),
+        noise_ratio=_median(ratio),
         sources=tuple(str(name) for name in calset.sources.name),
         filters=tuple(calset.filters),
         findings=(),
     )
-    findings = [
-        *_findings(calset, inspection),
-        *_about_cameras(sample.by_camera),
-        *_about_settings(calset.exposures, live),
-    ]
-    notes = [Finding("note", remark) for remark in calset.remarks]
+    findings = (*_findings(calset, inspection), *_about_cameras(by_camera), *_about_settings(e, live))
+    notes = (Finding("note", remark) for remark in calset.remarks)
     return dataclasses.replace(inspection, findings=(*findings, *notes))
 
 
-def _sample(calset: CalibrationSet) -> _Sample:
-    _, block = sampled(calset.intensities, len(calset.points), _LOOKED_AT)
-    rows = block.used & ~calset.exposures.flux_known
-    counts, sigma = block.counts[rows], block.sigma[rows]
-    ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
-    measured = np.isfinite(ratio).any(axis=0)
-    by_camera = np.full(ratio.shape[1], np.nan)
-    by_camera[measured] = np.nanmedian(ratio[:, measured], axis=0)
-    return _Sample(len(block.used), block.used, counts.ravel(), ratio[np.isfinite(ratio)], by_camera)
+def _median(values: np.ndarray) -> float:
+    """The median of the finite ones, NaN of none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")
 
 
 def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     e = calset.exposures
     plate = e.position(CALIBRATION_PLATE)
-    keys = [
-        (
-            str(e.kind[n]),
-            str(e.filter[n]),
-            f"{plate.angle[n]:g} deg" if plate.inside[n] else "out",
-            "star" if e.kind[n] == "standard" else (f"{e.teff[n]:g} K" if np.isfinite(e.teff[n]) else "flat"),
-        )
-        for n in range(len(e))
-    ]
+    plates = [f"{a:g} deg" if i else "out" for a, i in zip(plate.angle, plate.inside, strict=True)]
+    teff = np.where(e.kind == "standard", "star", [f"{t:g} K" if np.isfinite(t) else "flat" for t in e.teff])
+    keys = list(zip(map(str, e.kind), map(str, e.filter), plates, teff.tolist(), strict=True))
     groups = []
     for key in dict.fromkeys(keys):
         rows = np.array([n for n, group in enumerate(keys) if group == key])
@@ -257,23 +228,14 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if made.points < 2:
         # The needs of other instruments are in their descriptions.
         severity = "fault" if calset.instrument in shipped() else "note"
-        yield Finding(
-            severity,
-            "a single field point",
-            "the throughput over the field needs several, unless degree = 0 under [throughput] of the instrument file",
-        )
+        advice = "the throughput over the field needs several, unless degree = 0 under [throughput] of the"
+        yield Finding(severity, "a single field point", f"{advice} instrument file")
     elif made.points < _FEW_POINTS:
-        yield Finding(
-            "doubt",
-            f"only {made.points} field points",
-            "the throughput of each camera over the field has 15 terms",
-        )
+        advice = "the throughput of each camera over the field has 15 terms"
+        yield Finding("doubt", f"only {made.points} field points", advice)
     if np.isfinite(made.noise_ratio) and not _NOISE[0] <= made.noise_ratio <= _NOISE[1]:
-        yield Finding(
-            "doubt",
-            f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)",
-            "are N and N_ERR in electrons, or in counts (multiply by the gain)?",
-        )
+        what = f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)"
+        yield Finding("doubt", what, "are N and N_ERR in electrons, or in counts (multiply by the gain)?")
     yield from about_exposures(calset.exposures)
     if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * made.possible:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
@@ -286,47 +248,32 @@ def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
     finite = noise_ratio[np.isfinite(noise_ratio)]
     if finite.size and finite.max() > _UNEVEN * finite.min():
         listed = ", ".join(f"N{k} {value:.3g}" for k, value in enumerate(noise_ratio))
-        yield Finding(
-            "doubt",
-            f"N_ERR²/N differs between the cameras: {listed}",
-            "are all of them in electrons, or some in counts (multiply by the gain)?",
-        )
+        advice = "are all of them in electrons, or some in counts (multiply by the gain)?"
+        yield Finding("doubt", f"N_ERR²/N differs between the cameras: {listed}", advice)
 
 
 def _about_angles(made: Inspection) -> Iterator[Finding]:
     number, span = len(made.angles), 180.0 - made.widest_gap
     if number < 3:
-        yield Finding(
-            "fault",
-            f"{number} distinct polariser angle(s) modulo 180° with usable data",
-            "a fit needs at least 3, better 15 spread over 360°",
-        )
-        return
-    if span < _NARROW:
+        what = f"{number} distinct polariser angle(s) modulo 180° with usable data"
+        yield Finding("fault", what, "a fit needs at least 3, better 15 spread over 360°")
+    elif span < _NARROW:
         yield Finding("doubt", f"all polariser angles lie within {span:.3g}°", "spread them over 180°")
     elif number < _FEW_ANGLES:
-        yield Finding(
-            "doubt",
-            f"only {number} polariser angles modulo 180°",
-            "with fewer than 8, polariser errors cannot be separated from instrument errors",
-        )
+        advice = "with fewer than 8, polariser errors cannot be separated from instrument errors"
+        yield Finding("doubt", f"only {number} polariser angles modulo 180°", advice)
 
 
 def about_exposures(exposures: Exposures) -> Iterator[Finding]:
     """Notes on what exposures, taken or planned, cannot show whatever their counts are."""
     e = exposures
     if e.clp_in.any() and not e.further and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
-        yield Finding(
-            "note",
-            "the polariser turns through half a turn only",
-            "a full turn is needed to separate an encoder wobble from the instrument",
-        )
+        advice = "a full turn is needed to separate an encoder wobble from the instrument"
+        yield Finding("note", "the polariser turns through half a turn only", advice)
     if not np.any(e.direct("moon", "standard")):
-        yield Finding(
-            "note",
-            "the only light of known polarisation is that through the polariser (neither moonlit sky nor standards)",
-            "without these, neither the zero of the polariser nor telescope polarisation can be measured",
-        )
+        what = "the only light of known polarisation is that through the polariser (neither moonlit sky nor standards)"
+        advice = "without these, neither the zero of the polariser nor telescope polarisation can be measured"
+        yield Finding("note", what, advice)
 
 
 def _about_settings(exposures: Exposures, live: np.ndarray) -> Iterator[Finding]:
@@ -337,13 +284,9 @@ def _about_settings(exposures: Exposures, live: np.ndarray) -> Iterator[Finding]
     angles = [position.angle.astype(str) for position in used.positions.values()]
     distinct = len(set(zip(*angles, strict=True)))
     if distinct < _FEWEST_SETTINGS:
-        yield Finding(
-            "fault",
-            f"{distinct} distinct setting(s) of the moving elements with usable data",
-            f"a fit needs at least {_FEWEST_SETTINGS}",
-        )
+        what = f"{distinct} distinct setting(s) of the moving elements with usable data"
+        yield Finding("fault", what, f"a fit needs at least {_FEWEST_SETTINGS}")
     for prefix, position in used.positions.items():
         if like_radians(position.angle[position.inside]):
-            yield Finding(
-                "doubt", f"the angles of {prefix} look like radians", f"{prefix}_ANGLE is in degrees"
-            )
+            what = f"the angles of {prefix} look like radians"
+            yield Finding("doubt", what, f"{prefix}_ANGLE is in degrees")

@@ -147,10 +147,10 @@ def _joined_record(sets: tuple[CalibrationSet, ...], exposures: Exposures) -> Co
             what = "stands for pixels that were summed at one set of values; so do other sets here, or there are frames"
             again = "walop-jax refit A.fits B.fits --compress SET.fits -o RUN"
             raise _conflict(what, entry, "", f"compress the frames of all together: {again}")
-        numbers = exposures.exposure[rows][entry.compression.covers(entry.exposures)]
-        record = dataclasses.replace(
-            entry.compression, exposures=tuple(numbers.tolist()) if beside else entry.compression.exposures
-        )
+        record, numbers = entry.compression, exposures.exposure[rows]
+        if beside:
+            summed = numbers[record.covers(entry.exposures)]
+            record = dataclasses.replace(record, exposures=tuple(summed.tolist()))
     return record
 
 
@@ -161,10 +161,8 @@ def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> 
         what = f"has {other.cameras} cameras, {_name(first)} has {first.cameras}"
         raise _conflict(what, other, "N", "these are not sets of one instrument")
     # To a thousandth of a degree, and ten metres.
-    position, other_position = (
-        [site.latitude, site.longitude, site.elevation] for site in (first.site, other.site)
-    )
-    if not np.isclose(position, other_position, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
+    places = ([site.latitude, site.longitude, site.elevation] for site in (first.site, other.site))
+    if not np.isclose(*places, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
         what = f"is another site than that of {_name(first)}"
         raise _conflict(what, other, "SITELAT, SITELONG, SITEELEV")
 
@@ -185,10 +183,8 @@ def _parts(sets: tuple[CalibrationSet, ...], source_rows: list[np.ndarray]) -> l
     parts = []
     for grid, members in frames.items():
         stacks = tuple(stack for member, _ in members for stack in member.stacks)
-        frames_of_grid = FrameIntensities(grid, stacks)
-        parts.append(
-            Part(frames_of_grid, grid.points, np.concatenate([member_rows for _, member_rows in members]))
-        )
+        places = np.concatenate([member_rows for _, member_rows in members])
+        parts.append(Part(FrameIntensities(grid, stacks), grid.points, places))
     if tables:
         table, points = _join_tables([sets[n] for n in tables], [source_rows[n] for n in tables])
         parts.append(Part(table, points, np.concatenate([rows[n] for n in tables])))
@@ -224,11 +220,9 @@ def _join_exposures(sets: tuple[CalibrationSet, ...]) -> tuple[Exposures, list[s
             remarks.append(f"{_name(entry)} [EXPOSURES] {names}: column missing; taken as out of the beam")
         parts.append(e.placed(**absent).columns())
     names = dict.fromkeys(name for part in parts for name in part)
-    still = [np.zeros(len(part["EXPOSURE"])) for part in parts]  # of a column <P>_TURN that a part has not
-    columns = {
-        name: np.concatenate([part.get(name, zero) for part, zero in zip(parts, still, strict=True)])
-        for name in names
-    }
+    # A column <P>_TURN that a part has not is 0.
+    still = [(part, np.zeros(len(part["EXPOSURE"]))) for part in parts]
+    columns = {name: np.concatenate([part.get(name, zero) for part, zero in still]) for name in names}
     return Exposures.from_columns(columns | {"EXPOSURE": ids}), remarks
 
 
@@ -260,15 +254,10 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
             raise _conflict(what, sets[owner[row]], "SOURCES", advice)
         if not same:
             rows_kept.append(row)
-    place = {row: number for number, row in enumerate(rows_kept)}
-    rows = np.array(rows_kept, dtype=np.int64)
-    numbers = _fresh(columns["source"][np.unique(star)])
-    source = numbers[np.searchsorted(np.unique(star), star[rows])]
-    joined = Sources(
-        **{name: column[rows] for name, column in columns.items()} | {"source": source, "filter": band[rows]}
-    )
-    becomes = np.array([place[i] for i in star.tolist()], dtype=np.int64)
-    return joined, np.split(becomes, first[1:])
+    rows, stars = np.array(rows_kept, dtype=np.int64), np.unique(star)
+    columns["source"] = _fresh(columns["source"][stars])[np.searchsorted(stars, star)]
+    joined = Sources(**{name: column[rows] for name, column in (columns | {"filter": band}).items()})
+    return joined, np.split(np.searchsorted(rows, star), first[1:])
 
 
 def _equal(rows: np.ndarray) -> bool:
@@ -296,10 +285,8 @@ def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:
             old = filters.setdefault(name, curve)
             same = np.array_equal(old.wavelength, curve.wavelength)
             if not (same and np.array_equal(old.throughput, curve.throughput)):
-                advice = "correct one of them, or give it another name"
-                raise _conflict(
-                    f"{name!r} is another curve than in an earlier file", entry, "FILTERS", advice
-                )
+                what = f"{name!r} is another curve than in an earlier file"
+                raise _conflict(what, entry, "FILTERS", "correct one of them, or give it another name")
     return filters
 
 
@@ -318,28 +305,17 @@ def _join_tables(
     joined = Points(point=_fresh(ids), x=places[keep, 0], y=places[keep, 1])
     first_exposure = np.cumsum([0, *(len(entry.exposures) for entry in sets)])
     first_point = np.cumsum([0, *map(len, points)])
-    return TableIntensities(
-        int(first_exposure[-1]),
-        joined,
-        exposure=np.concatenate([t.exposure + n for t, n in zip(tables, first_exposure, strict=False)]),
-        point=np.concatenate([row[n + t.point] for t, n in zip(tables, first_point, strict=False)]),
+    columns = {
+        "exposure": [t.exposure + n for t, n in zip(tables, first_exposure, strict=False)],
+        "point": [row[n + t.point] for t, n in zip(tables, first_point, strict=False)],
         # The appended −1 is the entry of a row without a source (−1, the last entry).
-        source=np.concatenate(
-            [np.append(rows, -1)[t.source] for t, rows in zip(tables, source_rows, strict=True)]
-        ),
-        **{
-            name: np.concatenate([getattr(table, name) for table in tables])
-            for name in ("counts", "sigma", "flag", "used")
-        },
-        sky=_joined_sky(tables),
-    ), joined
-
-
-def _joined_sky(tables: Sequence[TableIntensities]) -> np.ndarray | None:
-    """The level of the sky in all tables, 0 in those that do not state it."""
-    if all(table.sky is None for table in tables):
-        return None
-    return np.concatenate([np.zeros_like(t.counts) if t.sky is None else t.sky for t in tables])
+        "source": [np.append(rows, -1)[t.source] for t, rows in zip(tables, source_rows, strict=True)],
+        **{name: [getattr(t, name) for t in tables] for name in ("counts", "sigma", "flag", "used")},
+    }
+    if any(table.sky is not None for table in tables):  # 0 in those that do not state it
+        columns["sky"] = [np.zeros_like(t.counts) if t.sky is None else t.sky for t in tables]
+    stacked = {name: np.concatenate(arrays) for name, arrays in columns.items()}
+    return TableIntensities(int(first_exposure[-1]), joined, **stacked), joined
 
 
 def _earlier_ones(points: Points) -> Int[np.ndarray, " p"]:
@@ -364,7 +340,5 @@ def _fresh(ids: np.ndarray) -> np.ndarray:
 
 def _stack_points(parts: Sequence[Part]) -> Points:
     """The field points of some parts, one after the other."""
-    columns = {
-        name: np.concatenate([getattr(part.points, name) for part in parts]) for name in ("point", "x", "y")
-    }
-    return Points(**columns | {"point": _fresh(columns["point"])})
+    point, x, y = (np.concatenate([getattr(part.points, n) for part in parts]) for n in ("point", "x", "y"))
+    return Points(_fresh(point), x, y)

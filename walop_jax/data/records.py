@@ -35,10 +35,7 @@ class DataFlag(enum.IntFlag):
 
 @dataclasses.dataclass(frozen=True)
 class Site:
-    """Place of the telescope.
-
-    `latitude` and `longitude` in degrees (east positive), `elevation` in metres.
-    """
+    """Place of the telescope. `latitude` and `longitude` in degrees (east positive), `elevation` in metres."""
 
     telescope: str
     latitude: float
@@ -80,10 +77,8 @@ class Position:
     turn: Any = None
 
     def __post_init__(self) -> None:
-        turn = (
-            np.zeros(len(self.inside)) if self.turn is None else np.where(self.inside, np.abs(self.turn), 0.0)
-        )
-        object.__setattr__(self, "turn", turn)
+        turn = 0.0 if self.turn is None else np.abs(self.turn)
+        object.__setattr__(self, "turn", np.where(self.inside, turn, 0.0))
 
     def __len__(self) -> int:
         return len(self.inside)
@@ -133,10 +128,8 @@ class Exposures:
         object.__setattr__(self, "positions", {**everywhere, **self.positions})
         for prefix, position in self.positions.items():
             if not PREFIX.fullmatch(prefix):
-                raise ValueError(
-                    f"{prefix!r} cannot be the prefix of a moving element: capital letters, digits and _, a letter "
-                    "first"
-                )
+                form = "capital letters, digits and _, a letter first"
+                raise ValueError(f"{prefix!r} cannot be the prefix of a moving element: {form}")
             if len(position) != len(self):
                 raise ValueError(f"{prefix} has {len(position)} positions for {len(self)} exposures")
             if not np.all(np.isfinite(position.angle[position.inside])):
@@ -176,10 +169,7 @@ class Exposures:
         return np.isin(self.kind, kinds) & ~self.clp_in
 
     def position(self, prefix: str) -> Position:
-        """The moving element of a column prefix.
-
-        Raises ValueError with the nearest names for one that the set does not have.
-        """
+        """The moving element of a column prefix; ValueError with the nearest names for one that is not there."""
         if prefix in self.positions:
             return self.positions[prefix]
         advice = f"give {prefix}_IN and {prefix}_ANGLE, in an observing plan moving = {{ {prefix} = [0, 22.5, 45] }}"
@@ -204,13 +194,9 @@ class Exposures:
         """Exposures from all columns by their names in EXPOSURES: the inverse of `columns`."""
         plain = {field.name.upper() for field in dataclasses.fields(cls)} - {"POSITIONS"}
         prefixes = [name.removesuffix("_IN") for name in columns if name.endswith("_IN")]
-        return cls(
-            **{name.lower(): columns[name] for name in plain},
-            positions={
-                p: Position(columns[f"{p}_IN"], columns[f"{p}_ANGLE"], columns.get(f"{p}_TURN"))
-                for p in prefixes
-            },
-        )
+        states = ((columns[f"{p}_IN"], columns[f"{p}_ANGLE"], columns.get(f"{p}_TURN")) for p in prefixes)
+        positions = {p: Position(*state) for p, state in zip(prefixes, states, strict=True)}
+        return cls(**{name.lower(): columns[name] for name in plain}, positions=positions)
 
     def _plain(self) -> dict[str, np.ndarray]:
         names = [field.name for field in dataclasses.fields(self) if field.name != "positions"]
@@ -260,8 +246,7 @@ class Sources:
     @classmethod
     def none(cls) -> Sources:
         """A table without sources."""
-        none = np.zeros(0)
-        return cls(np.zeros(0, dtype=np.int64), np.zeros(0, dtype="U1"), none, none, none, none, none)
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0, dtype="U1"), *[np.zeros(0)] * 5)
 
     @property
     def stars(self) -> Int[np.ndarray, " s"]:
@@ -271,12 +256,9 @@ class Sources:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The columns of SOURCES; FILTER and SCATTER only where there is any."""
-        columns = {field.name.upper(): getattr(self, field.name) for field in dataclasses.fields(self)}
-        if not (self.filter != "").any():
-            del columns["FILTER"]
-        if not self.scatter.any():
-            del columns["SCATTER"]
-        return columns
+        names = [field.name for field in dataclasses.fields(self)]
+        absent = {"filter": not (self.filter != "").any(), "scatter": not self.scatter.any()}
+        return {name.upper(): getattr(self, name) for name in names if not absent.get(name)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -329,9 +311,7 @@ class Compression:
 
     def covers(self, exposures: Exposures) -> Bool[np.ndarray, " e"]:
         """True for the exposures whose pixels were summed."""
-        if self.exposures is None:
-            return np.ones(len(exposures), bool)
-        return np.isin(exposures.exposure, self.exposures)
+        return np.isin(exposures.exposure, exposures.exposure if self.exposures is None else self.exposures)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -366,11 +346,11 @@ class CalibrationSet(Displayed):
         """Summary of the observations, without reading frames."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
+        x, y = (f"{values.min():+.3f} … {values.max():+.3f}°" for values in (points.x, points.y))
         facts = {
             "from": ", ".join(str(entry.path) for entry in self.inputs) or self.origin or "memory",
             "exposures": f"{len(e)} ({kinds})",
-            "field points": f"{len(points)}, X {points.x.min():+.3f} … {points.x.max():+.3f}°, "
-            f"Y {points.y.min():+.3f} … {points.y.max():+.3f}°",
+            "field points": f"{len(points)}, X {x}, Y {y}",
             "cameras": str(self.cameras),
             "filters": ", ".join(sorted({str(name) for name in e.filter})),
             "standards": ", ".join(str(name) for name in self.sources.name) or "none",
@@ -389,9 +369,9 @@ class CalibrationSet(Displayed):
         """
         block, e = self.intensities.block(0, len(self.points)), self.exposures
         used = block.used[:, :, None]
-        columns = {name.lower(): values for name, values in e.columns().items()}
-        for name in ("exposure", "kind", "clp_in", "clp_angle"):
-            columns.pop(name, None)
+        others = ("EXPOSURE", "KIND", "CLP_IN", "CLP_ANGLE")
+        columns = {name.lower(): values for name, values in e.columns().items() if name not in others}
+        stars = {f.name.upper(): getattr(self.sources, f.name) for f in dataclasses.fields(Sources)}
         return {
             "counts": np.where(used, block.counts, np.nan),
             "errors": np.where(used, block.sigma, np.nan),
@@ -404,9 +384,7 @@ class CalibrationSet(Displayed):
             "instrument": self.instrument,
             "site": self.site,
             "filters": dict(self.filters),
-            "sources": {f.name.upper(): getattr(self.sources, f.name) for f in dataclasses.fields(Sources)}
-            if len(self.sources)
-            else None,
+            "sources": stars if len(self.sources) else None,
             "origin": self.origin,
         }
 

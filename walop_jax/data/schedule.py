@@ -28,12 +28,7 @@ from walop_jax.io.toml import Reader
 
 TYPES: Mapping[str, str] = {"clp": "CAL-CAL", "lamp": "CAL-CAL", "moon": "CAL-MOO"}
 """Types of targets by KIND; of standards CAL-POL or CAL-UPO."""
-KINDS_OF: Mapping[str, str] = {
-    "CAL-CAL": "clp",
-    "CAL-MOO": "moon",
-    "CAL-POL": "standard",
-    "CAL-UPO": "standard",
-}
+KINDS_OF = {"CAL-CAL": "clp", "CAL-MOO": "moon", "CAL-POL": "standard", "CAL-UPO": "standard"}
 OF_SCIENCE = ("PAS", "SCI")
 """Types of targets that are no calibration."""
 FASTEST = 3.0  # turns per minute
@@ -64,16 +59,16 @@ def schedule_of(
     `facts` are name, pi, observer, mode. Raises `DataError` for exposures that no schedule can hold: more than four
     filters, other moving elements, a turn that is not one of half turns or faster than three turns a minute.
     """
-    facts, remarks = dict(facts or {}), list[str]()
+    remarks = list[str]()
     _check(exposures, filters)
-    rows = [_acquired(exposures[e : e + 1], filters) for e in range(len(exposures))]
+    each = [exposures[e : e + 1] for e in range(len(exposures))]
+    rows = [_acquired(exposure, filters) for exposure in each]
     rounded = [float(t) for t in exposures.exptime if t != round(t) or t < 1]
     if rounded:
         remarks.append(f"{len(rounded)} exposure times are no whole seconds ({rounded[0]:g} s): rounded")
-    label = [names[e] if names is not None else _target(exposures[e : e + 1]) for e in range(len(exposures))]
-    kinds = [
-        "CAL-UPO" if label[e] in unpolarised else _type(exposures[e : e + 1]) for e in range(len(exposures))
-    ]
+    usual = {"clp": "calibration polariser", "moon": "Moon"}
+    label = [usual.get(kind, kind) for kind in map(str, exposures.kind)] if names is None else names
+    kinds = ["CAL-UPO" if name in unpolarised else _type(each[e]) for e, name in enumerate(label)]
     night = _window(exposures.mjd, exposures.exptime, site)
     targets, objects = [], dict[str, dict[str, str]]()
     for (target, kind), group in itertools.groupby(range(len(rows)), lambda e: (label[e], kinds[e])):
@@ -82,8 +77,8 @@ def schedule_of(
             which = list(same)
             of_sky = kind != "CAL-CAL"
             window = _window(exposures.mjd[which], exposures.exptime[which], site) if of_sky else night
-            setting = dict(rows[which[0]])
-            exposure = {"multiples": len(which), "T": setting.pop("seconds")}
+            seconds, setting = rows[which[0]]
+            exposure = {"multiples": len(which), "T": seconds}
             acquisitions.append({"window": window, "guider": False, **setting, "exposure": exposure})
             ra, dec = float(exposures.ra[which[0]]), float(exposures.dec[which[0]])
             if math.isfinite(ra) and math.isfinite(dec):
@@ -91,16 +86,10 @@ def schedule_of(
                 objects.setdefault(target, {"name": target, **place})
         targets.append({"target": target, "type": kind, "acquisition": acquisitions})
     evening = _local(float(np.nanmin(exposures.mjd)), site) - datetime.timedelta(hours=12)
-    schedule = {
-        "name": facts.get("name", "calibration"),
-        "date": evening.date().isoformat(),
-        "pi": facts.get("pi", "walop-jax"),
-        "mode": facts.get("mode", "manual"),
-        "observer": facts.get("observer", "walop-jax"),
-        "objects": list(objects.values()),
-        "targets": targets,
-    }
-    return schedule, remarks
+    usual = {"name": "calibration", "pi": "walop-jax", "mode": "manual", "observer": "walop-jax"}
+    stated = {name: (facts or {}).get(name, text) for name, text in usual.items()}
+    head = {"name": stated.pop("name"), "date": evening.date().isoformat(), **stated}
+    return head | {"objects": list(objects.values()), "targets": targets}, remarks
 
 
 def read_schedule(
@@ -158,10 +147,11 @@ def _check(exposures: Exposures, filters: Mapping[str, int]) -> None:
         raise fail("no exposure has a time", column="MJD", advice="a schedule needs the date of its night")
 
 
-def _acquired(one: Exposures, filters: Mapping[str, int]) -> dict[str, Any]:
+def _acquired(one: Exposures, filters: Mapping[str, int]) -> tuple[int, dict[str, Any]]:
+    """Seconds of a single exposure, and its setting."""
     seconds = max(round(float(one.exptime[0])), 1)
     states = {word: _state(one.positions[prefix], seconds, prefix) for prefix, word in ELEMENTS.items()}
-    return {"filter": filters[str(one.filter[0])], **states, "seconds": seconds}
+    return seconds, {"filter": filters[str(one.filter[0])], **states}
 
 
 def _state(at: Position, seconds: int, prefix: str) -> dict[str, Any]:
@@ -184,10 +174,6 @@ def _check_half_turns(turn: float, prefix: str, file: object = "") -> None:
         what = f"a turn of {turn:g} deg is none of half turns: the angle at which it began counts, and is not stated"
         advice = f"choose speed and time so that 6 × speed × T is a multiple of {ALIKE:g} deg, or take it from the log"
         raise fail(what, file=file, column=f"{prefix}_TURN", advice=advice)
-
-
-def _target(one: Exposures) -> str:
-    return {"clp": "calibration polariser", "moon": "Moon"}.get(str(one.kind[0]), str(one.kind[0]))
 
 
 def _type(one: Exposures) -> str:

@@ -13,12 +13,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from astropy import units
 from jaxtyping import Bool, Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.data.records import DataFlag
-from walop_jax.data.units import Place, check_partners, convert_unit, unit_of
+from walop_jax.data.units import Place, check_partners, convert_unit, differs, unit_of
 from walop_jax.io.errors import nearest, rows_text
 
 Kind = Literal["int", "float", "bool", "str"]
@@ -80,11 +79,8 @@ _OF_A_SOURCE = Rule(
     "is not a temperature of a source",
     "in kelvin; NaN means a flat photon spectrum, as an empty cell of a text does",
 )
-_IS_JULIAN = Rule(
-    lambda mjd: np.abs(mjd) > 1e6,
-    "is not a Modified Julian Date",
-    "is this a Julian Date? subtract 2400000.5",
-)
+_JULIAN = "is this a Julian Date? subtract 2400000.5"
+_IS_JULIAN = Rule(lambda mjd: np.abs(mjd) > 1e6, "is not a Modified Julian Date", _JULIAN)
 _TIME = Rule(lambda time: (time < 0) | np.isinf(time), "is not a time", "seconds; NaN where it is not known")
 _POSITIVE = Rule(
     lambda error: ~(error > 0) | np.isinf(error),
@@ -199,11 +195,10 @@ def _moving_columns(columns: Collection[str], place: Place) -> dict[str, Column]
         if last not in ("IN", "ANGLE") or name == last or name in rules:
             continue
         if not PREFIX.fullmatch(prefix):
-            raise place.fail(
-                f"{prefix!r} is no name of a moving element",
-                name,
-                "letters, digits and _, a letter first; rename the column if it is none of a moving element",
+            advice = (
+                "letters, digits and _, a letter first; rename the column if it is none of a moving element"
             )
+            raise place.fail(f"{prefix!r} is no name of a moving element", name, advice)
         inside, angle = f"{prefix}_IN", f"{prefix}_ANGLE"
         if angle not in columns:
             pairs = [entry for entry in columns if entry.endswith("_ANGLE")]
@@ -241,40 +236,23 @@ def read_table(hdu: Any, columns: Mapping[str, Column], place: Place) -> tuple[d
     table without rows.
     """
     names = column_names(hdu, place)
+    unknown = [name for name in names if name not in columns]
+    stored, units_of, absent = dict[str, np.ndarray](), dict[str, str](), dict[str, list[str]]()
+    remarks = [place.remark(f"unknown column, not used ({nearest(name, columns)})", name) for name in unknown]
     for name, column in columns.items():
-        if column.missing is None and name not in names:
-            unknown = sorted(set(names) - set(columns))
-            advice = f"add it{' (' + nearest(name, unknown) + ')' if unknown else ''}"
-            raise place.fail("the column is missing", name, advice)
-    rows = int(hdu.header["NAXIS2"])
-    if rows == 0:
-        raise place.fail("has no rows", advice="a calibration set needs at least one")
-    remarks = [
-        place.remark(f"unknown column, not used ({nearest(name, columns)})", name)
-        for name in names
-        if name not in columns
-    ]
-    table: dict[str, Any] = {}
-    units_of: dict[str, str] = {}
-    absent: dict[str, list[str]] = {}
-    for name, column in columns.items():
-        if name in names:
-            index = names.index(name)
-            unit = units_of[name] = (hdu.columns[index].unit or "").strip()
-            stored = _stored(hdu, index, name, place)
-            table[name] = values_of(stored, name, column, place, unit=unit)
-            if column.true != 1 and stored.dtype.kind == "b":
-                what = f"holds truth values: true is taken as {column.true}, {DataFlag(column.true).meaning}"
-                remarks.append(place.remark(what, name))
-            if unit and column.kind == "float" and units.Unit(unit) != units.Unit(column.unit):
-                remarks.append(
-                    place.remark(f"is in {unit}, converted to {column.unit or 'a fraction'}", name)
-                )
-        else:
-            table[name] = np.full(rows, column.missing)
+        if name not in names:
             if column.remarked:
                 absent.setdefault(str(column.missing), []).append(name)
-    check_partners(units_of, _units(columns), place)
+            continue
+        index = names.index(name)
+        stored[name] = _stored(hdu, index, name, place)
+        unit = units_of[name] = (hdu.columns[index].unit or "").strip()
+        if column.true != 1 and stored[name].dtype.kind == "b":
+            what = f"holds truth values: true is taken as {column.true}, {DataFlag(column.true).meaning}"
+            remarks.append(place.remark(what, name))
+        if column.kind == "float" and unit and differs(unit, column.unit):
+            remarks.append(place.remark(f"is in {unit}, converted to {column.unit or 'a fraction'}", name))
+    table = _filled(stored, units_of, int(hdu.header["NAXIS2"]), columns, place, sorted(unknown))
     for missing, left_out in absent.items():
         what = f"column{'s' if len(left_out) > 1 else ''} missing; using {missing}"
         remarks.append(place.remark(what, ", ".join(left_out)))
@@ -288,28 +266,38 @@ def table_of(given: Mapping[str, Any], columns: Mapping[str, Column], place: Pla
     `columns` do not have.
     """
     rows = max(len(values) for values in given.values())
-    if rows == 0:
-        raise place.fail("has no rows", advice="a calibration set needs at least one")
     for name, values in given.items():
         if name not in columns:
             raise place.fail("there is no such column", name, nearest(name, columns))
         if len(values) != rows:
             raise place.fail(f"has {len(values)} values, another column {rows}", name, "one for each row")
-    table = {}
+    return _filled(given, {name: unit_of(values) for name, values in given.items()}, rows, columns, place)
+
+
+def _filled(
+    given: Mapping[str, Any],
+    units_of: Mapping[str, str],
+    rows: int,
+    columns: Mapping[str, Column],
+    place: Place,
+    unknown: Collection[str] = (),
+) -> dict[str, np.ndarray]:
+    """The columns of a table from those that are given, in their units; `unknown` are names of others that it has."""
     for name, column in columns.items():
-        if name in given:
-            table[name] = values_of(given[name], name, column, place)
-        elif column.missing is None:
-            raise place.fail("the column is missing", name, "add it")
-        else:
-            table[name] = np.full(rows, column.missing)
-    check_partners({name: unit_of(values) for name, values in given.items()}, _units(columns), place)
+        if column.missing is None and name not in given:
+            like = f" ({nearest(name, unknown)})" if unknown else ""
+            raise place.fail("the column is missing", name, f"add it{like}")
+    if rows == 0:
+        raise place.fail("has no rows", advice="a calibration set needs at least one")
+    table = {
+        name: values_of(given[name], name, column, place, unit=units_of[name])
+        if name in given
+        else np.full(rows, column.missing)
+        for name, column in columns.items()
+    }
+    numbers = {name: column.unit for name, column in columns.items() if column.kind == "float"}
+    check_partners(units_of, numbers, place)
     return table
-
-
-def _units(columns: Mapping[str, Column]) -> dict[str, str]:
-    """Units of the columns that are numbers."""
-    return {name: column.unit for name, column in columns.items() if column.kind == "float"}
 
 
 # ---------------------------------------------------------------------------------------- values of a column
@@ -438,9 +426,8 @@ def _shaped(values: np.ndarray, name: str, rule: Column, place: Place) -> np.nda
 
 MISSING = ("", "nan", "na", "n/a", "<na>", "none", "null", "--", "-", "...")
 """Texts of a cell without a value, in small letters."""
-_TRUTH = dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0) | dict.fromkeys(
-    ("false", "f", "0", "0.0", "no", *MISSING), 0.0
-)
+_TRUTH = dict.fromkeys(("false", "f", "0", "0.0", "no", *MISSING), 0.0)
+_TRUTH |= dict.fromkeys(("true", "t", "1", "1.0", "yes"), 1.0)
 
 
 def _from_text(text: np.ndarray, rule: Column, name: str, place: Place) -> Float[np.ndarray, ...]:
@@ -480,6 +467,5 @@ def in_unit(values: Any, unit: str, name: str) -> Float[np.ndarray, "*s"]:
     except (TypeError, ValueError):
         raise place.fail("is not made of numbers", name, f"give numbers in {unit or 'fractions'}") from None
     flat = np.atleast_1d(numbers).astype(np.float64)
-    return (convert_unit(flat, unit_given, unit, name, place) if unit_given else flat).reshape(
-        np.shape(numbers)
-    )
+    flat = convert_unit(flat, unit_given, unit, name, place) if unit_given else flat
+    return flat.reshape(np.shape(numbers))

@@ -52,10 +52,8 @@ def builtin_filter(name: str) -> FilterCurve:
     if wavelength is not None:
         return FilterCurve(name=name, wavelength=np.array([wavelength]), throughput=np.ones(1))
     if name not in _TABLES:
-        raise fail(
-            f"no built-in filter is called {name!r}",
-            advice=f"add it to the FILTERS table; {nearest(name, (*BUILTIN_FILTERS, 'MONO-6500'))}",
-        )
+        advice = f"add it to the FILTERS table; {nearest(name, (*BUILTIN_FILTERS, 'MONO-6500'))}"
+        raise fail(f"no built-in filter is called {name!r}", advice=advice)
     table = Path(__file__).with_name(_TABLES[name])
     wavelength, throughput = np.loadtxt(table, delimiter=",", unpack=True, encoding="utf-8")
     return FilterCurve(name=name, wavelength=wavelength * 1e-4, throughput=throughput.copy())
@@ -88,21 +86,15 @@ class Settings:
     turns: Mapping[str, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lengths = {len(values) for values in (*self._plain(), *self.positions.values(), *self.turns.values())}
+        lengths = sorted({len(values) for values in (*self._plain(), *self._moved())})
         if len(lengths) > 1:
-            raise ValueError(
-                f"columns of {' and '.join(map(str, sorted(lengths)))} rows in one table of settings"
-            )
+            raise ValueError(f"columns of {' and '.join(map(str, lengths))} rows in one table of settings")
 
     @classmethod
     def default(cls, count: int, filter_name: str = DEFAULT_FILTER) -> Settings:
         """SDSS-r, flat photon spectrum, all moving elements out, 10 °C, on the meridian."""
-        return cls(
-            filter=np.full(count, filter_name),
-            teff=np.full(count, np.nan),
-            temperature=np.full(count, TEMPERATURE),
-            hour_angle=np.zeros(count),
-        )
+        teff, temperature = np.full(count, np.nan), np.full(count, TEMPERATURE)
+        return cls(np.full(count, filter_name), teff, temperature, hour_angle=np.zeros(count))
 
     @classmethod
     def of(cls, exposures: Exposures, moving: Iterable[str]) -> Settings:
@@ -134,10 +126,7 @@ class Settings:
 
     def __getitem__(self, rows: Rows) -> Settings:
         return Settings(
-            filter=self.filter[rows],
-            teff=self.teff[rows],
-            temperature=self.temperature[rows],
-            hour_angle=self.hour_angle[rows],
+            *(values[rows] for values in self._plain()),
             positions={prefix: angle[rows] for prefix, angle in self.positions.items()},
             turns={prefix: turn[rows] for prefix, turn in self.turns.items()},
         )
@@ -195,8 +184,6 @@ class Settings:
         """Key that distinguishes the optics of a single row; ValueError for several rows."""
         if len(self) != 1:
             raise ValueError(f"one setting is asked for, {len(self)} are given")
-        inside = tuple(sorted(self.inside().items()))
-        inside += tuple(
-            sorted((prefix, float(turn.item())) for prefix, turn in self.turns.items() if turn.any())
-        )
+        turns = sorted((prefix, float(turn.item())) for prefix, turn in self.turns.items() if turn.any())
+        inside = (*sorted(self.inside().items()), *turns)
         return (str(self.filter[0]), inside, float(self.temperature[0]), float(self.hour_angle[0]))

@@ -32,10 +32,8 @@ def shipped_standards() -> Any:
     names = [str(name) for name in table["NAME"]]
     order = list(dict.fromkeys(names))
     degree, error = (np.asarray(table[name], float) for name in ("P", "P_ERR"))
-    angle, stated, scatter = (
-        np.deg2rad(np.asarray(table[name].to_value("deg"), float))
-        for name in ("ANGLE", "ANGLE_ERR", "ANGLE_SCATTER")
-    )
+    angles = (table[name].to_value("deg") for name in ("ANGLE", "ANGLE_ERR", "ANGLE_SCATTER"))
+    angle, stated, scatter = (np.deg2rad(np.asarray(values, float)) for values in angles)
     scatter = np.where(np.isfinite(scatter), scatter, np.deg2rad(USUAL_SCATTER))
     across = 2.0 * degree * np.hypot(np.nan_to_num(stated), scatter)
     across = np.where(degree > POLARISED * error, across, error)

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -183,9 +183,8 @@ def _decoded(content: bytes, path: Path) -> str:
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError as error:
-        raise fail(
-            f"is not text in UTF-8 (byte {error.start})", file=path, advice="save it as UTF-8"
-        ) from None
+        what = f"is not text in UTF-8 (byte {error.start})"
+        raise fail(what, file=path, advice="save it as UTF-8") from None
     if "\0" in text:
         raise fail("holds NUL characters", file=path, advice="is it text? Save it as CSV in UTF-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
@@ -211,18 +210,13 @@ def _from_csv(text: str, path: Path, needed: Collection[str]) -> tuple[Any, tupl
         options = {"delimiter": separator} if kind == "ascii.basic" else {}
         table = _astropy_table(text + "\n", kind, guess=False, **options)
     except UNREADABLE as error:
+        what = f"cannot be read as a table: {one_line(error)}"
+        advice = f"line 1 should name the columns, separated as the values are; it is {header[:60]!r}"
         if uneven := re.search(r"inconsistent with data columns.*line (\d+)", str(error)):
             what = f"has not as many cells as line 1 in {rows_text([int(uneven[1])])}"
-            raise fail(
-                what,
-                file=path,
-                advice="write empty cells too; decimal commas need semicolons between columns",
-            ) from error
-        advice = (
-            f"line 1 should name the columns, separated as the values are; it is {header[:60]!r}; decimal commas need "
-            "semicolons between columns"
-        )
-        raise fail(f"cannot be read as a table: {one_line(error)}", file=path, advice=advice) from error
+            advice = "write empty cells too"
+        commas = "decimal commas need semicolons between columns"
+        raise fail(what, file=path, advice=f"{advice}; {commas}") from error
     for index, name in enumerate(table.colnames):
         if name.upper() == "ID" and table[name].dtype.kind in "if":
             _keep_texts(table, index, text, separator)
@@ -274,7 +268,8 @@ def _separator_of(header: str, needed: Collection[str]) -> str:
 def _with_points(rest: str, separator: str, path: Path) -> tuple[str, str]:
     """Lines with decimal commas as such with points, and words for that; `DataError` where both are there."""
     lines = rest.split("\n", _LOOKED_AT)[:_LOOKED_AT]
-    cells = [cell.strip(' "') for line in lines for cell in _cells(line, separator)]
+    parts = (line.split(separator if separator != " " else None) for line in lines)
+    cells = [cell.strip(' "') for line in parts for cell in line]
     numbers = [cell for cell in cells if _NUMBER.fullmatch(cell)]
     if not any("," in cell for cell in numbers):
         return rest, ""
@@ -286,7 +281,3 @@ def _with_points(rest: str, separator: str, path: Path) -> tuple[str, str]:
     between = re.escape(separator) if separator != " " else r"\s"
     comma = re.compile(rf'(?m)(^|[{between}" ])([+-]?\d+),(\d+(?:[eE][+-]?\d+)?)(?=$|[{between}" ])')
     return comma.sub(r"\1\2.\3", rest), ", decimals by commas"
-
-
-def _cells(line: str, separator: str) -> Sequence[str]:
-    return line.split(separator) if separator != " " else line.split()

@@ -107,10 +107,8 @@ class TableIntensities(Intensities):
         x, y = self.points.x[start:stop], self.points.y[start:stop]
         block = empty_block(x, y, self.exposures, self.cameras)
         at = (self.point[rows] - start, self.exposure[rows])
-        block.counts[at] = self.counts[rows]
-        block.sigma[at] = self.sigma[rows]
-        block.used[at] = True
-        block.source[at] = self.source[rows]
+        for name in ("counts", "sigma", "used", "source"):
+            getattr(block, name)[at] = getattr(self, name)[rows]
         return block
 
 
@@ -159,30 +157,17 @@ def table_intensities(
     _, inverse, number = np.unique(pair, return_inverse=True, return_counts=True)
     if np.any(twice := number[inverse] > 1):
         first = np.flatnonzero(pair == pair[np.argmax(twice)])
-        raise place.fail(
-            f"EXPOSURE {table['EXPOSURE'][first[0]]}, POINT {table['POINT'][first[0]]} is there twice, "
-            f"in {rows_text(first)}",
-            "EXPOSURE, POINT",
-            f"keep one row of each pair ({int(twice.sum())} rows are concerned)",
-        )
+        ids = ", ".join(f"{name} {table[name][first[0]]}" for name in ("EXPOSURE", "POINT"))
+        advice = f"keep one row of each pair ({int(twice.sum())} rows are concerned)"
+        raise place.fail(f"{ids} is there twice, in {rows_text(first)}", "EXPOSURE, POINT", advice)
     counts, sigma, flag = table["N"], table["N_ERR"], table["FLAG"]
     used, spoilt, impossible = usable(counts, sigma, flag)
     place.refuse(impossible, "is zero or negative", "N_ERR", "give the true error, or set FLAG")
     remarks = _judge(counts, used, spoilt, place)
     source, unlisted = _source_rows(table["SOURCE"], exposures, exposure, sources, used, place)
-    intensities = TableIntensities(
-        len(exposures),
-        points,
-        exposure=exposure,
-        point=point,
-        source=source,
-        counts=counts,
-        sigma=sigma,
-        flag=flag,
-        used=used,
-        sky=_sky(table, place),
-    )
-    return intensities, remarks + unlisted
+    sky = _sky(table, place)
+    rows = (exposure, point, source, counts, sigma, flag, used, sky)
+    return TableIntensities(len(exposures), points, *rows), remarks + unlisted
 
 
 def _cameras(counts: np.ndarray, sigma: np.ndarray, exposures: Exposures, place: Place) -> None:
@@ -202,9 +187,8 @@ def _sky(table: dict[str, Any], place: Place) -> Float[np.ndarray, "r k"] | None
     sky = np.where(np.isnan(table["SKY"]), 0.0, table["SKY"])
     if sky.shape != table["N"].shape:
         raise place.fail(f"has {sky.shape[1]} value(s) in a row", "SKY", "give the sky of every camera, as N")
-    place.refuse(
-        (sky < 0) | np.isinf(sky), "is below 0 or infinite", "SKY", "the level that was subtracted, or NaN"
-    )
+    advice = "the level that was subtracted, or NaN"
+    place.refuse((sky < 0) | np.isinf(sky), "is below 0 or infinite", "SKY", advice)
     return sky
 
 
@@ -213,12 +197,10 @@ def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Plac
     bad = np.flatnonzero(spoilt)
     if len(bad) > _SPOILT * len(spoilt):
         cameras = [f"N[{k}]" for k in range(counts.shape[1]) if not np.any(np.isfinite(counts[:, k]))]
-        raise place.fail(
-            f"{100 * len(bad) / len(spoilt):.0f} % of the rows are not finite or far below zero "
-            f"({rows_text(bad)}){', no data at all in ' + ', '.join(cameras) if cameras else ''}",
-            "N, N_ERR",
-            "repair the reduction, or set FLAG where it fails",
-        )
+        empty = f", no data at all in {', '.join(cameras)}" if cameras else ""
+        what = f"{100 * len(bad) / len(spoilt):.0f} % of the rows are not finite or far below zero"
+        advice = "repair the reduction, or set FLAG where it fails"
+        raise place.fail(f"{what} ({rows_text(bad)}){empty}", "N, N_ERR", advice)
     if not np.any(used):
         raise place.fail("no row can be used: all are flagged or spoilt", "FLAG", "look at the reduction")
     values = counts[used]
@@ -272,7 +254,7 @@ def _source_rows(
     lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
-    remark = f"{place.file} [{place.extension}] SOURCE: not in SOURCES, taken as unknown in {rows_text(lost)}"
+    remark = place.remark(f"not in SOURCES, taken as unknown in {rows_text(lost)}", "SOURCE")
     return rows, [remark] if len(lost) else []
 
 
@@ -299,27 +281,24 @@ def mask_repeats(
 
     remarks: list[str] = []
     alike: list[str] = []
+    differ = "have the same time and settings but different counts"
     for first, *repeats in groups.values():
         rows = rows_of(first)
         for repeat in repeats:
-            ids, rows_again = (
-                f"exposures {exposures.exposure[first]} and {exposures.exposure[repeat]}",
-                rows_of(repeat),
-            )
-            if len(rows) and all(np.array_equal(v[rows], v[rows_again]) for v in (point, intensities.counts)):
+            ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[repeat]}"
+            again = rows_of(repeat)
+            if len(rows) and all(np.array_equal(v[rows], v[again]) for v in (point, intensities.counts)):
                 remarks.append(f"{ids} are the same to the last bit, the second is not used")
-                used[rows_again] = False
-            elif fine and np.isin(point[rows[used[rows]]], point[rows_again[used[rows_again]]]).any():
-                what = (
-                    f"{ids} (rows {first} and {repeat}, counted from 0) have the same time and settings but"
-                )
+                used[again] = False
+            elif fine and np.isin(point[rows[used[rows]]], point[again[used[again]]]).any():
+                what = f"{ids} (rows {first} and {repeat}, counted from 0) {differ}"
                 advice = "no camera takes two exposures at once: correct the times, or write NaN"
-                raise Place(file, "EXPOSURES").fail(f"{what} different counts", "MJD", advice)
+                raise Place(file, "EXPOSURES").fail(what, "MJD", advice)
             else:
                 alike.append(ids)
     if alike:
         suffix = f" (and {len(alike) - 1} pairs more)" if len(alike) > 1 else ""
-        remarks.append(f"{alike[0]} have the same time and settings but different counts{suffix}")
+        remarks.append(f"{alike[0]} {differ}{suffix}")
     return intensities.using(used), remarks
 
 
@@ -359,10 +338,9 @@ def repeated_counts(
     for name, ids, row in (("exposures", exposures.exposure, exposure), ("points", points.point[places], at)):
         copies = np.flatnonzero(2 * np.bincount(row, again) > np.bincount(row))
         if len(copies):
-            yield (
-                f"{file} [INTENSITIES] N: {name} {some(ids[copies].astype(str).tolist(), 5)} have the counts of others "
-                "at the same places; remove them if they are copies, which make errors too small"
-            )
+            what = f"{name} {some(ids[copies].astype(str).tolist(), 5)} have the counts of others at the same places"
+            advice = "remove them if they are copies, which make errors too small"
+            yield f"{file} [INTENSITIES] N: {what}; {advice}"
             return
 
 
@@ -370,13 +348,11 @@ def equal_rows(columns: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
     """Number of the group of equal rows of columns, floats in single precision, that every row is in."""
     mixed = np.full(len(columns[0]), 0x9E3779B97F4A7C15, np.uint64)
     for column in columns:  # a hash of 64 bits: of a million rows two collide in one of 10⁷ tables
+        words = column
         if column.dtype.kind == "f":
-            single = np.where(
-                np.isnan(column), np.float32(np.nan), column.astype(np.float32) + np.float32(0.0)
-            )
-            words = single.astype(np.float32).view(np.uint32).astype(np.uint64)
-        else:
-            words = column.astype(np.uint64)
+            single = column.astype(np.float32) + np.float32(0.0)  # −0 is 0
+            words = np.where(np.isnan(column), np.float32(np.nan), single).view(np.uint32)
+        words = words.astype(np.uint64)
         mixed = (mixed ^ words) * np.uint64(0xBF58476D1CE4E5B9)
         mixed ^= mixed >> np.uint64(29)
     return np.unique(mixed, return_inverse=True)[1].reshape(-1)

@@ -45,10 +45,7 @@ def is_sexagesimal(value: Any) -> bool:
 
 
 def degrees_of(text: str | Sequence[str], unit: str) -> Any:
-    """The angle (deg) of a text, or those of several; `unit` (hourangle, deg) is that of one that has none in it.
-
-    Raises ValueError for anything but an angle, minutes beyond 60 included.
-    """
+    """The angles (deg) of texts; `unit` (hourangle, deg) is that of one without; ValueError for what is no angle."""
     from astropy.coordinates import Angle  # imported here: it takes a seventh of a second
 
     return Angle(text, unit=unit).deg
@@ -87,7 +84,7 @@ def partner_of(name: str) -> str:
 
 def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
     """Raise `DataError` where some of columns that belong together have a unit to be converted and others have none."""
-    converted = [name for name, unit in given.items() if unit and _differs(unit, wanted)]
+    converted = [name for name, unit in given.items() if unit and differs(unit, wanted)]
     without = [name for name, unit in given.items() if not unit]
     if converted and without:
         what = f"has no unit, {converted[0]} is in {given[converted[0]]}"
@@ -102,7 +99,8 @@ def check_partners(given: Mapping[str, str], wanted: Mapping[str, str], place: P
             check_units({partner: given[partner], name: unit}, wanted[name], place)
 
 
-def _differs(unit: str, wanted: str) -> bool:
+def differs(unit: str, wanted: str) -> bool:
+    """True where a unit is to be converted."""
     try:
         return units.Unit(unit) != units.Unit(wanted)
     except ValueError:
@@ -134,17 +132,15 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     if wanted == "h" and unit_given.is_equivalent(units.deg):
         target = units.hourangle
     try:
-        return np.asarray(
-            units.Quantity(values, unit_given).to_value(target, units.temperature()), dtype=np.float64
-        )
+        converted = units.Quantity(values, unit_given).to_value(target, units.temperature())
+        return np.asarray(converted, dtype=np.float64)
     except units.UnitConversionError as error:
+        what = f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}"
         advice = f"convert the column to {wanted or 'a fraction without unit'}"
         if wanted in ("electron", "ct"):
             per_time = unit_given.is_equivalent(target / units.s)
             advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
-        raise place.fail(
-            f"the unit {unit!r} cannot be converted to {wanted or 'none'!r}", name, advice
-        ) from error
+        raise place.fail(what, name, advice) from error
 
 
 def _is_logarithmic(unit: Any) -> bool:

@@ -154,9 +154,8 @@ def in_memory(columns: Any, name: str = "the table") -> InputTable:
             single = {key for key, values in dict(columns).items() if np.ndim(values) == 0}
             table = Table({k: np.repeat(v, rows, axis=0) if k in single else v for k, v in arrays.items()})
     except (TypeError, ValueError) as error:
-        raise fail(
-            f"is no table: {one_line(error)}", file=name, advice="give columns of one length"
-        ) from error
+        advice = "give columns of one length"
+        raise fail(f"is no table: {one_line(error)}", file=name, advice=advice) from error
     return _input_table(Path(name), table)
 
 
@@ -168,10 +167,7 @@ def _input_table(path: Path, table: Any, remarks: Sequence[str] = ()) -> InputTa
 
 
 def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
-    """A column as an array in the unit, and of the kind, that `rule` asks for.
-
-    Raises `DataError` naming file, column and rows for what cannot be converted.
-    """
+    """A column in the unit and of the kind of `rule`; `DataError`, with rows, for what cannot be converted."""
     place, column = Place(source.path, ""), source.column(name)
     if column is not None:
         if (partner := partner_of(name)) in source.names and rule.kind == "float":

@@ -23,7 +23,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
 
-EXTENSION = "COMPRESSION"
+EXTENSION, _AGAIN = "COMPRESSION", "compress the frames again"
 MOST_EXPOSURES = 1_000_000  # of a run that a header may claim
 
 
@@ -51,24 +51,23 @@ def read_compression(hdu: Any, path: Path) -> Compression:
     place, header = Place(path, EXTENSION), hdu.header
     for name in ("NPIXELS", "CHI2", "DOF"):
         if _asked(header, name) is None:
-            raise place.fail("is missing or no number", name, "compress the frames again")
+            raise place.fail("is missing or no number", name, _AGAIN)
     names = [name.upper() for name in getattr(getattr(hdu, "columns", None), "names", [])]
     if sorted(names) != ["NAME", "VALUE"]:
-        raise place.fail("has not the columns NAME and VALUE", advice="compress the frames again")
+        raise place.fail("has not the columns NAME and VALUE", advice=_AGAIN)
     values = np.asarray(hdu.data["VALUE"], float)
     if not np.isfinite(values).all():
-        raise place.fail("is not finite", "VALUE", "compress the frames again")
+        raise place.fail("is not finite", "VALUE", _AGAIN)
     frames = []
     while f"SHA{len(frames) + 1}" in header:
         number = len(frames) + 1
         frames.append(InputFile(Path(str(header.get(f"FILE{number}", ""))), str(header[f"SHA{number}"])))
+    by_name = zip(hdu.data["NAME"], values.tolist(), strict=True)
     return Compression(
         pixels=int(header["NPIXELS"]),
         chi2=float(header["CHI2"]),
         dof=int(header["DOF"]),
-        values={
-            str(name).strip(): float(value) for name, value in zip(hdu.data["NAME"], values, strict=True)
-        },
+        values={str(name).strip(): value for name, value in by_name},
         frames=tuple(frames),
         gain=_asked(header, "STRUCTG"),
         response=_asked(header, "STRUCTR"),
@@ -88,9 +87,7 @@ def _of_runs(text: object, place: Place) -> tuple[int, ...]:
     runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
     ends = [(int(run[1]), int(run[2])) for run in runs if run]
     if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
-        raise place.fail(
-            f"is {text!r}, not runs of numbers like 0:23", "EXPOSURE", "compress the frames again"
-        )
+        raise place.fail(f"is {text!r}, not runs of numbers like 0:23", "EXPOSURE", _AGAIN)
     return tuple(number for first, last in ends for number in range(first, last + 1))
 
 
@@ -102,10 +99,9 @@ def _asked(header: Any, name: str) -> float | None:
 
 def remark(found: Compression, points: int) -> str:
     """Caution about a set that stands for pixels."""
-    return (
-        f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was "
-        f"{found.chi2 / max(found.dof, 1):.5g}: structure below a twentieth of the field is not seen here"
-    )
+    what = f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was"
+    ratio = found.chi2 / max(found.dof, 1)
+    return f"{what} {ratio:.5g}: structure below a twentieth of the field is not seen here"
 
 
 # -------------------------------------------------------------------------------------------------- tables
@@ -125,9 +121,8 @@ def write_calibration_set(
     >>> walop.write_calibration_set("copy.fits", calset)
     """
     with atomic_path(path, overwrite=overwrite) as temporary:
-        hdus: list[Any] = [_primary(calset, path)]
-        for name, columns in set_tables(calset).items():
-            hdus.append(set_table_hdu(name, columns, path))
+        tables = set_tables(calset).items()
+        hdus: list[Any] = [_primary(calset, path), *(set_table_hdu(*table, path) for table in tables)]
         if calset.compression is not None:
             hdus.append(compression_hdu(calset.compression, path))
         sign_and_write(hdus, temporary)

@@ -47,6 +47,7 @@ HEADING = "Polarization Transmission Data"
 
 _SLACK = Decimal("1e-8")  # of a total that was rounded
 _AGAIN = "export the file again"
+_WITHOUT = f"{_AGAIN}, or without this field point"
 _NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?")
 _CONFIGURATION = re.compile(r"Configuration\s+(\d+)\s+of\s+\d+")
 _FOLDER = re.compile(r"config\w*?[ _-]*(\d+)", re.IGNORECASE)
@@ -121,9 +122,8 @@ def _lines(path: Path) -> list[str]:
         # All that is read is ASCII, so any one-byte encoding (and UTF-8) may pass for Latin-1.
         text = content.decode("utf-16") if marked else content.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     except OSError as error:
-        raise fail(
-            f"cannot be read: {error.strerror or error}", file=path, advice="look at its rights"
-        ) from error
+        what = f"cannot be read: {error.strerror or error}"
+        raise fail(what, file=path, advice="look at its rights") from error
     except UnicodeDecodeError as error:
         raise fail("is cut off within a letter", file=path, advice=_AGAIN) from error
     if "\0" in text:
@@ -142,11 +142,8 @@ def _header(lines: list[str], offset: int, path: Path) -> tuple[str, int, float]
         raise _fault(path, offset + 1, "does not name its configuration", _AGAIN)
     folder = _FOLDER.fullmatch(path.parent.name)
     if folder and int(folder[1]) != configurations[0]:
-        raise fail(
-            f"says configuration {configurations[0]} in a folder {path.parent.name!r}",
-            file=path,
-            advice="move it",
-        )
+        what = f"says configuration {configurations[0]} in a folder {path.parent.name!r}"
+        raise fail(what, file=path, advice="move it")
     title = cards.get("Title", (0, ""))[1]
     if "Field is unpolarized." in lines:
         return title, configurations[0], -math.inf
@@ -186,9 +183,7 @@ def _blocks(lines: list[str], start: int, path: Path) -> list[_Block]:
         elif match := _TOTAL.fullmatch(line):
             blocks[-1].total = _number(match[1], "the total", path, n)
         elif line:
-            raise _fault(
-                path, n, f"{line!r} says something unknown", f"{_AGAIN}, or without this field point"
-            )
+            raise _fault(path, n, f"{line!r} says something unknown", _WITHOUT)
     else:
         raise _fault(path, len(lines), "ends ahead of its part on chief rays: it is cut off", _AGAIN)
     _check(blocks[-1], path)
@@ -214,9 +209,7 @@ def _check(block: _Block, path: Path) -> None:
 
 def _number(text: str, what: str, path: Path, line: int) -> Decimal:
     if not _NUMBER.fullmatch(text):
-        raise _fault(
-            path, line, f"{what} is {text!r}, not a number", f"{_AGAIN}, or without this field point"
-        )
+        raise _fault(path, line, f"{what} is {text!r}, not a number", _WITHOUT)
     return Decimal(text.replace(",", "."))
 
 
@@ -272,10 +265,8 @@ def import_transmissions(
         advice = "export the same fields and states in all four"
         raise fail(f"no row has all four cameras, missing are {missing}", file=folder, advice=advice)
     if not np.all(row):
-        remarks.append(
-            f"{folder}: {np.sum(~row)} of {row.size} rows (wavelength, state, field point) are left out because "
-            f"a camera is missing: {missing}"
-        )
+        what = f"{np.sum(~row)} of {row.size} rows (wavelength, state, field point) are left out because"
+        remarks.append(f"{folder}: {what} a camera is missing: {missing}")
     # Exposures and points without a row are left out too, what remains is numbered anew.
     values[~row] = np.nan
     exposed, places = row.any(axis=-1), row.reshape(-1, len(yx)).any(axis=0)
@@ -305,9 +296,8 @@ def import_transmissions(
     table = TableIntensities.of(calset.intensities, calset.points)
     dark = np.any(table.counts == 0, axis=-1)
     if np.any(dark):
-        remarks.append(
-            f"{folder}: {np.sum(dark)} of {len(dark)} rows have a transmission of 0 (vignetted): flagged, not used"
-        )
+        what = f"{np.sum(dark)} of {len(dark)} rows have a transmission of 0 (vignetted): flagged, not used"
+        remarks.append(f"{folder}: {what}")
     table = table.flagged(dark, DataFlag.EDGE_OR_VIGNETTED)
     return dataclasses.replace(calset, intensities=table, remarks=(*remarks, *calset.remarks))
 
@@ -315,27 +305,19 @@ def import_transmissions(
 def _exports(folder: Path, tell: Callable[[str], None]) -> tuple[list[TransmissionExport], list[str]]:
     if not folder.is_dir():
         raise fail("is not a folder", file=folder, advice="give the folder that holds the exports")
-    files = sorted(
-        f for f in folder.rglob("*") if f.suffix.lower() == ".txt" and f.name[0] != "." and f.is_file()
-    )
-    exports: list[TransmissionExport] = []
-    ignored: list[Path] = []
+    texts = (f for f in folder.rglob("*") if f.suffix.lower() == ".txt" and f.name[0] != "." and f.is_file())
+    files, read = sorted(texts), list[TransmissionExport | None]()
     for n, file in enumerate(files):
         if n % 100 == 0:
             tell(f"reading {n} of {len(files)} files")
-        export = read_export(file)
-        if export is None:
-            ignored.append(file)
-        else:
-            exports.append(export)
+        read.append(read_export(file))
+    exports = [export for export in read if export is not None]
     if not exports:
-        raise fail(f"none of {len(files)} text files begins with {HEADING!r}", file=folder,
-                   advice="export that analysis as text, in English")  # fmt: skip
-    if ignored:
-        return exports, [
-            f"{folder}: {len(ignored)} text files are no exports and not read, {ignored[0].name} for one"
-        ]
-    return exports, []
+        what = f"none of {len(files)} text files begins with {HEADING!r}"
+        raise fail(what, file=folder, advice="export that analysis as text, in English")
+    ignored = [file.name for file, export in zip(files, read, strict=True) if export is None]
+    what = f"{folder}: {len(ignored)} text files are no exports and not read"
+    return exports, [f"{what}, {ignored[0]} for one"] if ignored else []
 
 
 def _instrument(
@@ -347,12 +329,12 @@ def _instrument(
     if wanted is None and len(named) == 1:
         return named.pop()
     if wanted is None:
-        raise fail(f"the titles name {len(named)} instruments ({', '.join(titles)})", file=folder,
-                   advice=f"say which it is: --instrument {' or '.join(shipped())}")  # fmt: skip
+        advice = f"say which it is: --instrument {' or '.join(shipped())}"
+        what = f"the titles name {len(named)} instruments ({', '.join(titles)})"
+        raise fail(what, file=folder, advice=advice)
     if named - {wanted.upper()}:
-        remarks.append(
-            f"{folder}: the titles name {', '.join(sorted(named))}, {wanted.upper()} was asked for"
-        )
+        named_by = ", ".join(sorted(named))
+        remarks.append(f"{folder}: the titles name {named_by}, {wanted.upper()} was asked for")
     return wanted.upper()
 
 
@@ -363,10 +345,7 @@ def _dense(
     yx: Float[np.ndarray, "p 2"],
     configurations: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "w s p 4"], Float[np.ndarray, "w s p 4"]]:
-    """Transmissions of all exports and the steps they are printed in, NaN where there are none.
-
-    Duplicates are refused, and so is a configuration that is none of the cameras.
-    """
+    """Transmissions of all exports and their printed steps, NaN where there are none; duplicates are refused."""
     values, step = np.full((2, len(wavelengths), len(angles), len(yx), 4), np.nan)
     owner = np.full(values.shape, -1)
     place = {(y, x): n for n, (y, x) in enumerate(yx.tolist())}
@@ -375,12 +354,9 @@ def _dense(
             advice = f"the cameras are {list(configurations)}: remove the file, or name others (--cameras)"
             raise fail(f"configuration {e.configuration} is no camera", file=e.path, advice=advice)
         points = [place[key] for key in zip(e.y.tolist(), e.x.tolist(), strict=True)]
-        at = np.ix_(
-            np.searchsorted(wavelengths, e.wavelength),
-            np.searchsorted(angles, [e.angle]),
-            np.array(points),
-            np.array([configurations.index(e.configuration)]),
-        )
+        rows = np.searchsorted(wavelengths, e.wavelength), np.searchsorted(angles, [e.angle])
+        camera = np.array([configurations.index(e.configuration)])
+        at = np.ix_(*rows, np.array(points), camera)
         if np.any(owner[at] >= 0):
             raise fail(f"holds what stands in {exports[int(owner[at].max())].path} too (configuration, state, "
                        "field point, wavelength)", file=e.path, advice="remove one of them")  # fmt: skip

@@ -1,14 +1,26 @@
 """Equivalence class of each addition of a diagnosis: candidates indistinguishable from it, and their effect on stars.
 
 Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
-             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step (`class_average`). Their
-             prior probabilities are equal: a name does not make a candidate more probable.
+             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step. Their prior probabilities are
+             equal: a name does not make a candidate more probable.
+One step     A model without some amplitudes a leaves r + D of the residuals r, D = −J_a a. Other columns K take their
+             place with b = −(KᵀPK)⁺ KᵀP(r + D), and all other parameters move by −J_o⁺ (D + K b), where P projects off
+             the other columns J_o. Exact where everything is linear.
 Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
              show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
              Equivalent members count once. The product is their mean, and its covariance has their spread: values and
              covariance of a model that includes all of them, each amplitude 0 in the models of the others.
-Shape        A description has deviations beside its class (`description_shape`), marginalised by one linear step.
+Shape        A description without a name is the simplest one that explains the data: a polynomial over the field, one
+             law over the exposures, one kind of polarisation. Its cause has no reason to be so simple. Deviations from
+             it are a Gaussian process, marginalised by one linear step,
+                 δ(x, t) = Σ_j c_j f_j(x, t),   c_j ~ N(0, s²/(n ⟨f_j²⟩))
+             f_j products of a pattern over the field (all polynomials to the third degree), a law over the exposures
+             (none, those of the descriptions, other slow ones) for each kind of polarisation (`GENERATORS`; of cameras
+             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
+             laws: every kind may be as large as what was described, in any shape. In a product, stars have those
+             without a dependence and with those described; others change the parameters alone. Source: model
+             discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
 """
@@ -19,6 +31,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Collection, Iterator, Sequence
+from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,23 +41,23 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_average import distinct
-from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum
-from walop_jax.diagnosis.description_shape import shape_changes
-from walop_jax.diagnosis.design import taken_up
+from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum, distinct
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
-from walop_jax.diagnosis.score import Projector, log_bayes
+from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
 from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Context, Described, FreeForm
-from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
+from walop_jax.model.effects.change import AMPLITUDES, KINDS, SINGLE, SLOW, InExposures, patched
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.deviations import CUBIC
+from walop_jax.model.effects.optics import GENERATORS, generators_of
+from walop_jax.model.light import mean_wavelengths
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step
@@ -168,7 +181,7 @@ class _Laid:
         """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
         if FreeForm.name in self.fit.model.effect_names:  # it has every shape
             return None
-        changes, widths = shape_changes(self.fit, self.columns)
+        changes, widths, laws = shape_changes(self.fit, self.columns)
         if not changes:
             return None
         sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
@@ -186,8 +199,6 @@ class _Laid:
         _, at_any = self.added([((1.0, change),) for change in steady])
         acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
         # Of other dependences than those described stars have none: each is a program's worth of derivatives.
-        described = self.fit.model.instrument(self.fit.values).effect(Described.name)
-        laws = {(), *(Sentence.parsed(text).beside_field for text in described.sentences)}  # type: ignore[attr-defined]
         on_stars = tuple(
             j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws
         )
@@ -227,8 +238,7 @@ class _Step:
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
         self.rest = np.delete(np.arange(design.jacobian.shape[1]), at)
-        self.jacobian = design.jacobian[:, self.rest]
-        self.projector = Projector(self.jacobian, design.eliminated)
+        self.projector = Projector(design.jacobian[:, self.rest], design.eliminated)
         self.left = self.projector(design.residual + self.lost)
 
     def addition(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
@@ -279,17 +289,24 @@ class _Step:
 
     def in_other_kinds(self, member: Likeness) -> Likeness | None:
         """A member that is about exposures of one KIND, in all others instead; None for any other."""
-        kinds_by_sentence = [_kinds_of(sentence) for amplitude in member.sums for _, sentence in amplitude]
+        kinds_by_sentence = [
+            [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
+            for amplitude in member.sums
+            for _, sentence in amplitude
+        ]
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
         kinds = set(itertools.chain(*kinds_by_sentence))
         other_kinds = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
         if len(kinds) != 1 or not all(kinds_by_sentence) or not other_kinds:
             return None
         (kind,) = kinds
+
+        def elsewhere(sentence: Sentence, other: str) -> Sentence:
+            factors = (f"kind {other}" if text == f"kind {kind}" else text for text in sentence.factors)
+            return dataclasses.replace(sentence, factors=tuple(factors))
+
         sums = tuple(
-            tuple(
-                (-size, _in_kind(sentence, kind, new)) for size, sentence in amplitude for new in other_kinds
-            )
+            tuple((-size, elsewhere(sentence, new)) for size, sentence in amplitude for new in other_kinds)
             for amplitude in member.sums
         )
         column = design.stacked([self.laid.columns.of(sums)])
@@ -302,12 +319,7 @@ class _Step:
         return twin._replace(evidence=member.evidence) if near else twin
 
     def member(
-        self,
-        name: str,
-        sums: tuple[Sum, ...],
-        column: Matrix,
-        widths: Vector,
-        evidence: float | None = None,
+        self, name: str, sums: tuple[Sum, ...], column: Matrix, widths: Vector, evidence: float | None = None
     ) -> Likeness:
         """The model with other amplitudes, at the minimum; `evidence` in place of that of the linear step."""
         laid, projected = self.laid, self.projector(column)
@@ -318,8 +330,9 @@ class _Step:
         amplitudes = -covariance @ along
         count = len(laid.fit.model.free)
         values, slopes = np.zeros(count), np.zeros((count, len(widths)))
-        values[self.rest] = -taken_up(self.jacobian, self.projector, self.lost + column @ amplitudes)
-        slopes[self.rest] = -taken_up(self.jacobian, self.projector, column)
+        change = np.column_stack([self.lost + column @ amplitudes, column])
+        moved = -self.projector.taken_up(self.projector.basis.T @ change)
+        values[self.rest], slopes[self.rest] = moved[:, 0], moved[:, 1:]
         values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
@@ -329,35 +342,18 @@ class _Step:
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
         """True if a model can include all sentences."""
         sentences = [sentence for amplitude in sums for _, sentence in amplitude]
-        if not all(map(self.laid.columns.has, sums)):
-            return False
-        if any(
-            sentence.kind not in KINDS or not all(isinstance(f, str) for f in sentence.factors)
-            for sentence in sentences
+        stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
+        if not all(map(self.laid.columns.has, sums)) or not all(
+            s.kind in KINDS and all(isinstance(f, str) for f in s.factors) and s.text not in stated
+            for s in sentences
         ):
             return False
-        stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
-        if stated.intersection(sentence.text for sentence in sentences):
-            return False
+        bare = dataclasses.replace(self.laid.template, effects=())
         try:
-            patched(
-                dataclasses.replace(self.laid.template, effects=()),
-                [(sentence, jnp.zeros(())) for sentence in sentences],
-            )
+            patched(bare, [(sentence, jnp.zeros(())) for sentence in sentences])
         except ValueError:
             return False
         return True
-
-
-def _kinds_of(sentence: Sentence) -> list[str]:
-    """The KINDs of exposures that a sentence is about."""
-    return [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
-
-
-def _in_kind(sentence: Sentence, kind: str, other: str) -> Sentence:
-    """A sentence about exposures of another KIND."""
-    factors = tuple(f"kind {other}" if text == f"kind {kind}" else text for text in sentence.factors)
-    return dataclasses.replace(sentence, factors=factors)
 
 
 def _texts(sums: Sequence[Sum]) -> set[str]:
@@ -368,3 +364,93 @@ def _texts(sums: Sequence[Sum]) -> set[str]:
 def covariance_of_free(fit: FitResult) -> Matrix:
     """Covariance of the free parameters of a fit."""
     return fit.covariance[np.ix_(fit.model.free, fit.model.free)]
+
+
+# ------------------------------------------------------------------------------ deviations from a description
+
+_OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
+
+
+class _Place(NamedTuple):
+    """Changes of one kind of quantity at one place."""
+
+    kinds: tuple[str, ...]
+    where: str
+    place: str
+    origin: str
+
+
+def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vector, set[tuple[str, ...]]]:
+    """Deviations from the shapes of the descriptions in a model, their prior widths, and the laws described."""
+    instrument = fit.model.instrument(fit.values)
+    if not any(isinstance(effect, Described) for effect in instrument.effects):
+        return [], np.zeros(0), set()
+    described = instrument.effect(Described.name)
+    assert isinstance(described, Described)
+    data, squares = _AtData.of(columns), dict[_Place, float]()
+    laws: dict[_Place, dict[tuple[str, ...], None]] = {}
+    for change, amplitude in described.terms():
+        optical = change.kind.partition(" ")[0] in _OPTICS
+        place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
+        parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
+        for _, coefficient, factors in parts:
+            size = float(amplitude) * coefficient * data.rms(change.times(*factors))
+            squares[place] = squares.get(place, 0.0) + size**2
+        laws.setdefault(place, {(): None}).setdefault(change.beside_field)
+    listed = set(described.sentences)
+    changes, widths = list[Sentence](), list[float]()
+    for place, square in squares.items():
+        shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
+        count = len(shapes) / len(place.kinds)
+        for change in shapes:
+            rms = data.rms(change)
+            if change.text not in listed and square * rms > 0.0:
+                changes.append(change)
+                widths.append(np.sqrt(square / max(count, 1.0)) / rms)
+    return changes, np.array(widths), set().union(*laws.values())
+
+
+def _shapes(
+    place: _Place, laws: Sequence[tuple[str, ...]], fit: FitResult, columns: Columns
+) -> Iterator[Sentence]:
+    """All changes of a place with some laws, and other slow ones, that the model can include.
+
+    Steady gains are those of the throughput; other steady numbers have the first four patterns.
+    """
+    exposures, template = fit.calset.exposures, fit.model.template
+    over_field = len(fit.calset.points) >= FEWEST_POINTS
+    dependences = Dependences(exposures, over_field, (), np.ones(len(exposures), bool))
+    slow = [law for form in (*SLOW, *SINGLE) for law in dependences.of(form)] if len(laws) > 1 else []
+    for law in dict.fromkeys((*laws, *slow)):
+        patterns = CUBIC if law or place.kinds == GENERATORS else CUBIC[:4]
+        for pattern, kind in itertools.product(patterns if over_field else CUBIC[:1], place.kinds):
+            change = Sentence(kind, place.where, place.place, (*pattern, *law), place.origin)
+            try:
+                change.check_factors(template)
+            except ValueError:
+                continue
+            if columns.has(((1.0, change),)) and (law or kind != "gain"):
+                yield change
+
+
+@dataclasses.dataclass(frozen=True)
+class _AtData(InExposures):
+    """The (point, exposure) of a set; `wavelength` (µm) is the mean of the band of each exposure."""
+
+    wavelength: Any = 0.0
+    used: Any = None
+
+    @classmethod
+    def of(cls, columns: Columns) -> Self:
+        """Those of a likelihood."""
+        points, plan = columns.likelihood.calset.points, columns.plan
+        of_bands = np.asarray(mean_wavelengths(columns.patched, plan))
+        wavelength = of_bands[np.asarray(plan.band_of)[:, 0]]
+        return cls(
+            columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
+        )
+
+    def rms(self, change: Sentence) -> float:
+        """Root mean square of the factors of a change."""
+        sizes = np.nan_to_num(np.asarray(change.factor(self), float))
+        return float(np.sqrt(np.mean(np.broadcast_to(sizes, self.used.shape)[self.used] ** 2)))

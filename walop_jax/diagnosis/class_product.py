@@ -1,8 +1,11 @@
 """The product of a diagnosis: mean over the classes of its additions, with their spread in the covariance.
 
+Equation     m̄ = Σ w_k m_k,   C = Σ w_k [C_k + (m_k − m̄)(m_k − m̄)ᵀ],   w_k = B_k / Σ B
+Symbols      m_k values in model k, of numbers that may be 0 in some of them; C_k their covariance; B_k evidence
+Source       Leamer 1978, Specification Searches, ch. 4; Hoeting et al. 1999, Stat. Sci. 14, 382 (law of total variance)
 Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
-             others, so that values and covariance of the mixture (`class_average`) are sufficient: the matrix,
-             errors of stars and maps follow as for any other calibration.
+             others, so that values and covariance of the mixture are sufficient: the matrix, errors of stars and maps
+             follow as for any other calibration. Members with the same effect on the result count once.
              Deviations from the shape of a description are the effect `deviations`, with their covariance.
 Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
              only a class was identified and the product is not trusted: the ambiguity dominates the error. Likewise for
@@ -20,19 +23,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_average import known_apart_from, mixture
+from walop_jax.diagnosis.score import Matrix, Vector
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import some, two_digits
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 
@@ -87,14 +89,9 @@ class Shape(NamedTuple):
     spread: float
     stated: float
 
-    @property
-    def changes(self) -> dict[int, Sentence]:
-        """Those that act on starlight, by position."""
-        return {j: self.deviations.sums[j][0][1] for j in self.on_stars}
-
     def effect(self, context: Context) -> Deviations:
         """The effect that includes these, all zero."""
-        changes = self.changes.values()
+        changes = [self.deviations.sums[j][0][1] for j in self.on_stars]
         places = [
             " * ".join((f"{change.where} {change.place}", *change.beside_field))
             for change in changes
@@ -134,7 +131,8 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
     old, model = calibration.model, _holding(calibration, classes, context)
     parts = [p.part for p in model.parameters]
     new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
-    derivatives = list(_amplitudes_of(model, classes))
+    others = [member for addition in classes.additions for member in addition.members[1:]]
+    derivatives = [_derivatives(model, Described.name, member.sums) for member in others]
     if new:
         model = _with_ties(model, new, np.concatenate(derivatives, axis=1))
     place = np.array([model.index(name) for name in old.names])
@@ -161,11 +159,18 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         values += mean - start
         covariance += average - fitted
     if classes.shape is not None:  # the descriptions remain: their parameters are as free as before
-        deviations, amplitudes = classes.shape.deviations, _deviations_of(model, classes.shape)
+        deviations, acting = classes.shape.deviations, classes.shape.on_stars
+        sums = [total if j in acting else () for j, total in enumerate(deviations.sums)]
+        amplitudes = _derivatives(model, Deviations.name, sums)
         slopes = into @ deviations.slopes + amplitudes
         values += into @ deviations.values + amplitudes @ deviations.amplitudes
         covariance += slopes @ deviations.covariance @ slopes.T
-        model = _with_held(model, Deviations.name, values)
+        # Held at their values: fits of other data would not constrain them.
+        held = [
+            dataclasses.replace(p, free=False, start=float(value)) if p.part == Deviations.name else p
+            for p, value in zip(model.parameters, values, strict=True)
+        ]
+        model = dataclasses.replace(model, parameters=tuple(held))
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -202,21 +207,12 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
     return with_effects(model, [description], context)
 
 
-def _amplitudes_of(model: Model, classes: Classes) -> Iterator[Float[np.ndarray, "n a"]]:
-    """Derivative of all parameters by the amplitudes of every member but the first of each class, in order."""
-    for member in (member for addition in classes.additions for member in addition.members[1:]):
-        derivatives = np.zeros((len(model.parameters), len(member.sums)))
-        for j, combination in enumerate(member.sums):
-            for size, sentence in combination:
-                derivatives[model.index(f"{Described.name}.{sentence.label}"), j] += size
-        yield derivatives
-
-
-def _deviations_of(model: Model, shape: Shape) -> Float[np.ndarray, "n a"]:
-    """Derivative of all parameters by the amplitudes of deviations."""
-    derivatives = np.zeros((len(model.parameters), len(shape.deviations.sums)))
-    for j, change in shape.changes.items():
-        derivatives[model.index(f"{Deviations.name}.{change.label}"), j] = 1.0
+def _derivatives(model: Model, effect: str, sums: Sequence[Sum]) -> Float[np.ndarray, "n a"]:
+    """Derivative of all parameters by amplitudes, each a sum of changes that an effect of the model holds."""
+    derivatives = np.zeros((len(model.parameters), len(sums)))
+    for j, combination in enumerate(sums):
+        for size, sentence in combination:
+            derivatives[model.index(f"{effect}.{sentence.label}"), j] += size
     return derivatives
 
 
@@ -239,15 +235,6 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
             parameters[i] = dataclasses.replace(parameters[i], free=False)
         else:
             free.append(i)
-    return dataclasses.replace(model, parameters=tuple(parameters))
-
-
-def _with_held(model: Model, part: str, values: Vector) -> Model:
-    """The model with the parameters of an effect held at their values: fits of other data would not constrain them."""
-    parameters = [
-        dataclasses.replace(p, free=False, start=float(value)) if p.part == part else p
-        for p, value in zip(model.parameters, values, strict=True)
-    ]
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 
@@ -281,6 +268,42 @@ def only_a_class(classes: Classes) -> Iterator[str]:
             f"may differ from the description (p by {two_digits(100 * shape.spread)} %, median, where the errors of "
             f"the fit are {two_digits(100 * shape.stated)} %)"
         )
+
+
+def mixture(
+    weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequence[Matrix]
+) -> tuple[Vector, Matrix]:
+    """Mean and covariance over models of some probabilities, by the law of total variance."""
+    mean = weights @ values
+    away = values - mean
+    covariance = (away * weights[:, None]).T @ away
+    for weight, within in zip(weights, covariances, strict=True):
+        covariance += weight * within
+    return mean, covariance
+
+
+def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
+    """Conditional covariance of all others given the parameters `at`: C − C_a C_aa⁺ C_aᵀ, 0 in the rows of these."""
+    across = covariance[:, at]
+    conditional = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
+    conditional[at], conditional[:, at] = 0.0, 0.0
+    return 0.5 * (conditional + conditional.T)
+
+
+def distinct(
+    evidence: Vector, changes: Float[np.ndarray, "k p m"], errors: Float[np.ndarray, "p m"], alike: float
+) -> list[int]:
+    """Models with different changes, the most probable of each group of equivalent ones, best first.
+
+    Two are equivalent where their changes differ by less than `alike` of the errors, rms over places, in every element.
+    """
+    scale = np.where(errors > 0, errors, np.inf)
+    chosen: list[int] = []
+    for k in np.argsort(-evidence, kind="stable").tolist():
+        apart = (np.sqrt(np.mean(((changes[k] - changes[j]) / scale) ** 2, axis=0)).max() for j in chosen)
+        if all(distance >= alike for distance in apart):
+            chosen.append(k)
+    return chosen
 
 
 def _dominates(spread: float, stated: float) -> bool:

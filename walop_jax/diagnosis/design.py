@@ -33,7 +33,9 @@ Limits      The difference leaves 10⁻¹⁶ of the square of a column; what has
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -45,7 +47,7 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, Vector, gram
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood.columns import Columns
@@ -64,6 +66,7 @@ SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
 Cube = Float[np.ndarray, "p e k"]
+Pattern = Float[np.ndarray, "_ _"]
 
 
 class Measured:
@@ -157,26 +160,19 @@ class _Stratum(NamedTuple):
 
     name: str
     camera: Sequence[int]
-    patterns: Sequence[Float[np.ndarray, "_ _"]]
-    block: str | None = None
+    patterns: Sequence[Pattern]
+    block: str = ""
 
     @property
     def widths(self) -> Float[np.ndarray, " _"]:
         """Prior standard deviations of the amplitudes."""
         return np.full(len(self.camera), WIDTH)
 
-    @classmethod
-    def of_all(
-        cls,
-        cameras: Sequence[int],
-        name: str,
-        patterns: Sequence[Float[np.ndarray, "_ _"]],
-        block: str | None = None,
-    ) -> _Stratum:
-        """Each pattern in each of these cameras."""
-        return cls(
-            name, [k for _ in patterns for k in cameras], [p for p in patterns for _ in cameras], block
-        )
+
+def _in_each(cameras: Sequence[int], name: str, patterns: Sequence[Pattern], block: str = "") -> _Stratum:
+    """Each pattern in each of these cameras."""
+    pairs = list(itertools.product(patterns, cameras))
+    return _Stratum(name, [k for _, k in pairs], [pattern for pattern, _ in pairs], block)
 
 
 def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
@@ -218,7 +214,7 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
             patterns = [term[:, None] * stokes[..., i] for term in smooth.T]
-            yield _Stratum.of_all([k], f"vector {element} of {camera}", patterns, "vectors")
+            yield _in_each([k], f"vector {element} of {camera}", patterns, "vectors")
         for symbol, prefix in turning:
             position = e.position(prefix)
             through = position.inside & measured.used.any(axis=0)
@@ -229,13 +225,13 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
                 waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
                 patterns = [term[:, None] * wave for term in smooth.T[:3] for wave in waves]
                 block = "harmonics" if prefix == POLARISER else "exposures"
-                yield _Stratum.of_all([k], f"{harmonic}{symbol} of {camera}", patterns, block)
-        yield _Stratum.of_all([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
-        yield _Stratum.of_all([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
+                yield _in_each([k], f"{harmonic}{symbol} of {camera}", patterns, block)
+        yield _in_each([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
+        yield _in_each([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
     for name, quantity, block in (
         ("time", e.mjd[None, :], "exposures"),
         ("temperature", e.temp[None, :], "exposures"),
-        ("flux", measured.flux, None),
+        ("flux", measured.flux, ""),
     ):
         measured_values = quantity[measured.used] if quantity.shape == measured.used.shape else quantity
         if not np.isfinite(measured_values).any():
@@ -243,38 +239,36 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
         quantity = quantity - np.nanmean(measured_values)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
-            yield _Stratum.of_all(all_cameras, name, [np.nan_to_num(quantity / spread)], block)
+            yield _in_each(all_cameras, name, [np.nan_to_num(quantity / spread)], block)
     positions = [(prefix.lower(), positions_of(e, prefix)) for prefix in measured.likelihood.plan.moving]
     for name, label, block in (
         ("kind", e.kind, "exposures"),
-        ("filter", e.filter, None),
-        *((("plate" if prefix == "chwp" else prefix), label, None) for prefix, label in positions),
+        ("filter", e.filter, ""),
+        *((("plate" if prefix == "chwp" else prefix), label, "") for prefix, label in positions),
     ):
         patterns = [
             np.where(label == group, stokes[..., i], 0.0) for group in np.unique(label)[1:] for i in range(3)
         ]
         if patterns:
-            yield _Stratum.of_all(all_cameras, name, patterns, block)
+            yield _in_each(all_cameras, name, patterns, block)
     sky_gradients = [
         np.where(e.kind == group, term[:, None], 0.0)
         for group in np.unique(e.kind)[1:]
         for term in smooth.T[1:3]
     ]
     if sky_gradients:
-        yield _Stratum.of_all(all_cameras, "kind, over the field", sky_gradients)
+        yield _in_each(all_cameras, "kind, over the field", sky_gradients)
     if measured.has_gains:
         alone = list(np.eye(len(e))[:, None])
-        yield _Stratum.of_all(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
+        yield _in_each(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
     state = states(measured.likelihood.calset)
     several = np.unique(state) if len(np.unique(state)) < len(state) else ()
     if len(several) and measured.gained:
         patterns = [np.where(state == number, 1.0, 0.0)[None] for number in several]
-        yield _Stratum.of_all(measured.gained, STATES, patterns)
+        yield _in_each(measured.gained, STATES, patterns)
 
 
 # ----------------------------------------------------------------------------------------------------- one fit laid out
-
-Vector = Float[np.ndarray, " _"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -375,10 +369,6 @@ class Design:
         scaled, r = unit[rows], self.residual[rows]
         return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
 
-    def taken_up(self, along: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "f k"]:
-        """By how much the free parameters change when the model lacks some amplitudes (`taken_up`); `along` is QᵀC."""
-        return _taken_up(self.jacobian, self.projector, along)
-
     def robust_ratio(self, name: str) -> float:
         """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
 
@@ -397,36 +387,16 @@ class Design:
         return float(np.sqrt(np.max(np.sum(by_exposure**2, axis=0) / np.diag(inverse[:, at]))))
 
 
-def taken_up(
-    jacobian: Float[np.ndarray, "_ f"], projector: Projector, rows: Float[np.ndarray, "_ ..."]
-) -> Float[np.ndarray, "f ..."]:
-    """Change R⁻¹QᵀC of the parameters with the Jacobian J = QR, at first order, by changes C of the rows.
-
-    Q is the basis of `projector`, that of J.
-    """
-    return _taken_up(jacobian, projector, projector.basis.T @ rows)
-
-
-def _taken_up(
-    jacobian: Float[np.ndarray, "_ f"], projector: Projector, along: Float[np.ndarray, "q ..."]
-) -> Float[np.ndarray, "f ..."]:
-    unit, norm = unit_columns(jacobian)
-    return (np.linalg.lstsq(projector.basis.T @ unit, along, rcond=None)[0].T / norm).T
-
-
 HOLDOUT_FOLDS = 5
 
 
 def exposure_folds(design: Design) -> Int[np.ndarray, " d"]:
     """Fold of every data row: exposures of each kind and setting dealt out in turn."""
     e = design.fit.calset.exposures
-    fold = np.zeros(len(e), int)
-    groups: dict[tuple[str, ...], int] = {}
-    plate = positions_of(e, CALIBRATION_PLATE)
-    for i in range(len(e)):
-        key = (str(e.kind[i]), str(e.filter[i]), str(plate[i]))
-        fold[i] = groups.get(key, 0) % HOLDOUT_FOLDS
-        groups[key] = groups.get(key, 0) + 1
+    fold, groups = np.zeros(len(e), int), collections.Counter[tuple[str, ...]]()
+    for i, key in enumerate(zip(e.kind, e.filter, positions_of(e, CALIBRATION_PLATE), strict=True)):
+        fold[i] = groups[key] % HOLDOUT_FOLDS
+        groups[key] += 1
     return fold[design.exposure]
 
 
@@ -490,12 +460,9 @@ def _from_rows(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, 
         at = np.flatnonzero(camera == k)
         projections[:, at] = -rows[..., k] @ change[:, at]
     base, scores = projections[:-1], projections[-1]
+    names, widths = tuple(stratum.name for stratum in all_strata), [stratum.widths for stratum in all_strata]
+    before, remaining = np.diag(products).copy(), products - base.T @ base
     space = ScoreSpace(
-        names=tuple(stratum.name for stratum in all_strata),
-        sizes=tuple(len(stratum.camera) for stratum in all_strata),
-        widths=np.concatenate([stratum.widths for stratum in all_strata]),
-        before=np.diag(products).copy(),
-        gram=products - base.T @ base,
-        free=design.projector.free,
+        names, tuple(map(len, widths)), np.concatenate(widths), before, remaining, design.projector.free
     )
     return space, scores, float(residual @ residual)

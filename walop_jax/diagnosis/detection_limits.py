@@ -29,6 +29,7 @@ Limits      One effect at a time, to first order in its amplitude, for the shape
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -42,10 +43,10 @@ from walop_jax.calibration.could_hide import CouldHide, could_hide, hidden_error
 from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Examination, Matrix, Vector, examine, most_points
+from walop_jax.diagnosis.examination import Examination, Matrix, Vector, examine, most_points, smallest
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.hypotheses import Probe, fringes_of
+from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
@@ -57,7 +58,6 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.progress import Stage
 from walop_jax.io.text import two_digits, two_digits_range
 from walop_jax.model.effects import EffectKind
-from walop_jax.model.instrument import Instrument
 
 MANY_SHAPES = 8
 """Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
@@ -91,11 +91,6 @@ class DetectionLimit(NamedTuple):
         """The amplitude as it is spelled in tables."""
         return f"{self.effect}.{self.parameter}"
 
-    @property
-    def mistake(self) -> CouldHide:
-        """The effect at its detection limit."""
-        return CouldHide(self.name, EFFECT, self.detected[1], self.unit, "", True, False, self.error_of_qu)
-
 
 class ConditionLimit(NamedTuple):
     """Detection limit for the error of a number that a set states.
@@ -109,11 +104,6 @@ class ConditionLimit(NamedTuple):
     detected: float
     size: float
     error_of_qu: tuple[float, float]
-
-    @property
-    def mistake(self) -> CouldHide:
-        """The error of the number at `size`."""
-        return CouldHide(self.what, DATA, self.size, self.unit, "", True, False, self.error_of_qu)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -199,9 +189,14 @@ class DetectionLimits(Displayed):
         Errors are those of `could_hide`, for all others those of their own limits.
         """
         names = {m.name for m in self.could_hide}
-        effects = (limit for limit in self.limits if limit.effect not in thresholds.ASKED_BY_CAMERA)
-        others = (limit.mistake for limit in (*effects, *self.conditions))
-        further = [m for m in others if m.name not in names and np.isfinite(m.error[0])]
+        limits = [limit for limit in self.limits if limit.effect not in thresholds.ASKED_BY_CAMERA]
+        others = [(e.name, EFFECT, e.detected[1], e.unit, e.error_of_qu) for e in limits]
+        others += [(c.what, DATA, c.size, c.unit, c.error_of_qu) for c in self.conditions]
+        further = [
+            CouldHide(name, kind, size, unit, "", True, False, error)
+            for name, kind, size, unit, error in others
+            if name not in names and np.isfinite(error[0])
+        ]
         return tuple(sorted((*self.could_hide, *further), key=lambda m: (-m.error[0], -m.error[1])))
 
     def display(self) -> Display:
@@ -372,14 +367,17 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     slopes = slopes @ result.model.selection()
     chosen = _representative(columns)
-    probes, changes = [], [np.zeros((*matrix.shape, 0))]
-    template = result.model.template
+    changes, template = [np.zeros((*matrix.shape, 0))], result.model.template
+
+    def fringes(probe: Probe) -> bool:
+        terms = (change for member in probe.group for change in member.first_order(template))
+        return any(sentence.kind == "fringes" for change in terms for _, sentence in change)
+
     # Fringes need more wavelength nodes than all others: they have a program of their own.
-    for fringes in (False, True):
-        subset = [p for p in examination.probes if p.name in chosen and _has_fringes(p, template) == fringes]
+    probes = sorted((p for p in examination.probes if p.name in chosen), key=fringes)
+    for _, subset in itertools.groupby(probes, fringes):
         members = tuple(member for probe in subset for member in probe.group)
         changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
-        probes += subset
     change = np.concatenate(changes, axis=-1)
     starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
     place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
@@ -392,17 +390,12 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
         for c in (columns[i] for i in looked_at)
     ]
     along = design.products(raw, design.projector.basis).T
-    for i, taken_up in zip(looked_at, design.taken_up(along).T, strict=True):
+    for i, taken_up in zip(looked_at, design.projector.taken_up(along).T, strict=True):
         column = columns[i]
         slope = change[..., place[column.probe.name] + column.number]
         size = min(column.detected, float(column.probe.widths[column.number]))
         errors[i] = change_of_qu(matrix, matrix + size * (slope - slopes @ taken_up))
     return errors
-
-
-def _has_fringes(probe: Probe, template: Instrument) -> bool:
-    changes = (change for member in probe.group for change in member.first_order(template))
-    return any(True for change in changes for _ in fringes_of(change))
 
 
 def _representative(columns: Sequence[_Column]) -> set[str]:
@@ -430,24 +423,26 @@ def _collected(
     entries = []
     for (effect, parameter), members in groups.items():
         mine = [columns[i] for i in members]
-        near = _nearest(mine)
+        near = smallest(pair for c in mine for pair in c.rivals.items())
+        taken_for = [
+            name for name in sorted(near, key=near.__getitem__) if near[name] < thresholds.SEPARATION
+        ]
+        detected = [c.detected for c in mine]
         entries.append(
             DetectionLimit(
                 effect=effect.name,
                 parameter=parameter,
                 unit=effect.numbers()[parameter].unit,
-                detected=(min(c.detected for c in mine), max(c.detected for c in mine)),
+                detected=(min(detected), max(detected)),
                 named=max(c.named for c in mine),
-                taken_for=tuple(
-                    name for name in sorted(near, key=near.__getitem__) if near[name] < thresholds.SEPARATION
-                ),
+                taken_for=tuple(taken_for),
                 error_of_qu=over_field(errors[members]),
             )
         )
     names = tuple(dict.fromkeys(effect.name for effect, _ in groups))
     separation = np.full((len(names), len(names)), np.nan)
     for row, name in enumerate(names):
-        near = _nearest([c for c in columns if c.probe.effect.name == name])
+        near = smallest(p for c in columns if c.probe.effect.name == name for p in c.rivals.items())
         separation[row] = [near.get(rival, np.nan) for rival in names]
     points, result = examination.result.calset.points, examination.result
     setting = first_setting(result.calset, result.model.instrument(result.values))
@@ -471,15 +466,6 @@ def _collected(
     )
 
 
-def _nearest(columns: Sequence[_Column]) -> dict[str, float]:
-    """Distance of each rival from the amplitude and shape that it follows best."""
-    nearest: dict[str, float] = {}
-    for column in columns:
-        for name, value in column.rivals.items():
-            nearest[name] = min(value, nearest.get(name, np.inf))
-    return nearest
-
-
 # --------------------------------------------------------------------------------------------------- stated conditions
 
 
@@ -494,7 +480,7 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     columns = np.column_stack([item.column for item in scored])
-    taken_up = design.taken_up(design.projector.basis.T @ columns)
+    taken_up = design.projector.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
     limits = []

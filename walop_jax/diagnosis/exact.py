@@ -3,23 +3,41 @@
 Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det H_base) − Σ ln w, with O the objective (χ² of
                data and priors), H half its Hessian and w the prior widths of the added parameters; those of amplitudes
                are averaged over their scale (`score.log_bayes`).
+
+Other descriptions of the instrument are tried where a fit explains nothing:
+
+1. Every change that the instrument has a place for (`model/alternatives.py`) is put into the residuals at two places,
+   the fitted values and the start values: a description that is badly wrong has bent the fit. What the free parameters
+   could absorb of them, at the slopes of the description given, is projected out, priors included (one Gauss–Newton
+   step). Nothing is fitted; a sample of the field points is enough.
+2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
+   grow to make up for those, by more than one step can tell. Their evidence against the description given is half
+   the gain in χ² less the logarithm of the number of changes that were looked at.
+3. A change that gained nothing is not compared again once names have joined the model: these explain a part of the
+   misfit, and leave less for it to explain.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
-from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, Vector, fit
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model, model_without, with_effects
 
@@ -32,7 +50,7 @@ class Trial:
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
     where its linear step does not predict held-out data, `compared` holds the comparison of two fits
-    (`predictions.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
+    (`refits.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
     which it was not added, `groups` the groups of sentences that were added one after the other.
     """
 
@@ -77,10 +95,6 @@ class Trial:
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
-def _log_determinant(result: FitResult) -> float:
-    return float(np.linalg.slogdet(result.expansion.matrix)[1])
-
-
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
 
@@ -95,7 +109,8 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
     at = [i for i in amplitudes if model.names[i] not in base_names]
     gain = 0.5 * (base.expansion.objective - extended.expansion.objective)
-    occam = 0.5 * (_log_determinant(extended) - _log_determinant(base))
+    first, second = (np.linalg.slogdet(fitted.expansion.matrix)[1] for fitted in (base, extended))
+    occam = 0.5 * float(second - first)
     at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
     return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
 
@@ -156,19 +171,14 @@ def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> 
         try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
         for probe, score in places
     ]
-    best = max(trials, key=lambda t: t.evidence if _converged(t) else -np.inf)
-    alike = [t for t in trials if _converged(t) and t.evidence > best.evidence - thresholds.EVEN_ODDS]
-    alternatives = dict.fromkeys(
-        in_words(t.instance) for t in alike if _differ(t, best, thresholds.SEPARATION)
-    )
+    converged = [t for t in trials if t.fit is not None and t.fit.converged]
+    best = max(converged or trials[:1], key=lambda t: t.evidence)
+    alike = [t for t in converged if t.evidence > best.evidence - thresholds.EVEN_ODDS]
+    alternatives = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
     return dataclasses.replace(best, alternatives=tuple(alternatives))
 
 
-def _converged(trial: Trial) -> bool:
-    return trial.fit is not None and trial.fit.converged
-
-
-def _differ(first: Trial, second: Trial, separation: float) -> bool:
+def _differ(first: Trial, second: Trial) -> bool:
     assert first.fit is not None
     assert second.fit is not None
     if first.instance.choices() != second.instance.choices():
@@ -176,7 +186,7 @@ def _differ(first: Trial, second: Trial, separation: float) -> bool:
     at = first.fit.model.positions(first.effect.name)
     sigma = np.maximum(first.fit.sigma[at], second.fit.sigma[at])
     away = np.asarray(values_of(first.instance)) - np.asarray(values_of(second.instance))
-    return bool(np.any(np.abs(away) > separation * np.where(sigma > 0, sigma, np.inf)))
+    return bool(np.any(np.abs(away) > thresholds.SEPARATION * np.where(sigma > 0, sigma, np.inf)))
 
 
 def in_words(effect: Effect) -> str:
@@ -255,3 +265,99 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
         bare = result.likelihood.residuals(values)[1]
     change = bare - result.likelihood.residuals(result.values)[1]
     return change[result.likelihood.used].reshape(-1) / result.noise_scale
+
+
+CHOICE_ROWS = 6000
+"""(Exposure, point) pairs on which other descriptions of an instrument are compared before any of them is fitted."""
+
+NO_DIFFERENCE = 1e-6  # smallest change of the residuals, in standard deviations
+
+
+def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
+    """The model with the change of a sentence applied to its instrument, after all earlier changes."""
+    name = OtherDescription.name
+    if name in model.effect_names:
+        before = model.template.effect(name)
+        assert isinstance(before, OtherDescription)
+        sentence, model = f"{before.change}{JOINED}{sentence}", model_without(model, name)
+    return with_effects(model, [OtherDescription(change=sentence)], context)
+
+
+def other_descriptions(
+    result: FitResult,
+    context: Context,
+    fits: Callable[[], bool],
+    tell: Callable[[str], None],
+    *,
+    all_of_them: bool = True,
+    earlier: Mapping[str, Choice] | None = None,
+) -> tuple[list[Trial], dict[str, Choice]]:
+    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows.
+
+    `earlier` are those that were compared before the last names joined the model.
+    """
+    template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
+    if OtherDescription.name in result.model.effect_names:
+        template = result.model.template.effect(OtherDescription.name).patch(template)
+    else:
+        hopeless = {choice.change for choice in (earlier or {}).values() if not choice.gains}
+    curves = other_curves(template)
+    # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
+    sentences = tuple(alternatives(template)) if all_of_them else curves
+    asked = [sentence for sentence in sentences if sentence not in hopeless]
+    if not asked:
+        return [], {}
+    tell(f"comparing {len(asked)} other descriptions")
+    candidates = itertools.takewhile(lambda _: fits(), asked)
+    screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
+    compared, trials = {choice.change: choice for choice, _, _ in screened}, []
+    best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]
+    chosen = {choice.change for choice, _, _ in best}
+    others = [item for item in screened if item[0].change in curves and item[0].change not in chosen]
+    for choice, _, start in (*best, *others):
+        if not fits():
+            break
+        tell(f"trying another description: {choice.change}")
+        model = described_otherwise(result.model, choice.change, context)
+        try:
+            trial = try_model(result, OtherDescription, model, start, len(sentences))
+        except ValueError:  # a free parameter of a removed element has no prior and is undetermined
+            continue
+        assert trial.fit is not None
+        gain = (result.expansion.objective - trial.fit.expansion.objective) * result.noise_scale**2
+        compared[choice.change] = dataclasses.replace(choice, better_by=float(gain))
+        trials.append(trial)
+    return trials, compared
+
+
+def _screened(
+    result: FitResult, sentences: Iterable[str], context: Context
+) -> Iterator[tuple[Choice, float, Vector]]:
+    """Every effective change with its residual fraction, gain in χ² and starting values: the better of two."""
+    point_limit = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
+    calset = thinned(result.calset, point_limit, neighbours=1)
+    start = result.model.start.copy()  # but effects as they have been fitted
+    for name in result.model.effect_names:
+        start[result.model.positions(name)] = result.values[result.model.positions(name)]
+    likelihood = Likelihood.of(calset, result.model)
+    places = [
+        Design.of(dataclasses.replace(result, likelihood=likelihood, values=values))
+        for values in (result.values, start)
+    ]
+    reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
+    for sentence in sentences:
+        try:
+            model = described_otherwise(result.model, sentence, context)
+        except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
+            continue
+        changed, ratios = Likelihood.of(calset, model), []
+        for design in places:
+            rows = design.residual.copy()
+            residual = changed.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
+            rows[: design.rows] = residual / design.fit.noise_scale
+            if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
+                break
+            ratios.append(float(np.sum(design.projector(rows) ** 2)) / reference)
+        if len(ratios) == len(places) and np.isfinite(ratios).any():
+            best = int(np.nanargmin(np.where(np.isfinite(ratios), ratios, np.nan)))
+            yield Choice(sentence, ratios[best]), (1.0 - ratios[best]) * reference, places[best].fit.values

@@ -13,13 +13,12 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy
-from jaxtyping import Float
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
@@ -28,10 +27,11 @@ from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_colum
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, sentences_of
 from walop_jax.diagnosis.score import (
     Candidate,
+    Matrix,
     Score,
     ScoreSpace,
     ScoreTable,
-    corrected_p,
+    Vector,
     log_bayes,
     separations,
 )
@@ -41,8 +41,6 @@ from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.instrument import Instrument
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
 
 
@@ -59,11 +57,8 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         alive.sort(key=lambda item: -item[1].log_bayes)
         (probe, score), best = alive[0], alive[0][1].log_bayes
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
-        alternatives = [
-            item
-            for item in alive[1 : thresholds.MOST_FITTED]
-            if item[1].log_bayes > best - max(thresholds.WITHIN, 0.2 * best)
-        ]
+        least = best - max(thresholds.WITHIN, 0.2 * best)
+        alternatives = [item for item in alive[1 : thresholds.MOST_FITTED] if item[1].log_bayes > least]
         ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
@@ -106,9 +101,6 @@ def shortest(item: Ranked) -> Described:
     return Described.combine([item.probe.group[i] for i in best], amplitudes)
 
 
-# --------------------------------------------------------------------------------------------------- evidence
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evidence:
     """The part of one set of residuals that each candidate explains beyond the base parameters.
@@ -141,20 +133,22 @@ class Evidence:
         """Sentences in order of evidence, each less the logarithm of their number."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
-        candidates = [
-            Ranked(Described, p, score, score.log_bayes - price) for p, score in scored if score.testable
-        ]
+        candidates = (Ranked(Described, p, s, s.log_bayes - price) for p, s in scored if s.testable)
         return sorted(candidates, key=lambda item: -item.log_bayes)
+
+    def is_clear(self, score: Score) -> bool:
+        """True if a candidate is significant by itself, after correction for all."""
+        return self.table.corrected(score) < thresholds.ALARM
 
     @cached_property
     def significant(self) -> list[Ranked]:
         """Effects that are significant by themselves, best evidence first."""
-        return [r for r in self.ranked if self.table.corrected(r.score) < thresholds.ALARM]
+        return [item for item in self.ranked if self.is_clear(item.score)]
 
     @cached_property
     def significant_sentences(self) -> list[Ranked]:
         """Sentences that are significant by themselves, best evidence first."""
-        return [r for r in self.ranked_sentences if self.table.corrected(r.score) < thresholds.ALARM]
+        return [item for item in self.ranked_sentences if self.is_clear(item.score)]
 
     @property
     def alarm(self) -> bool:
@@ -196,29 +190,27 @@ class Evidence:
         alive = [score.log_bayes + fitted * self.by_fit(score) for score in self._pattern_scores]
         return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
 
-    def _p(self, score: Score) -> float:
-        return corrected_p(score.log_p, self.table.trials)
-
     @cached_property
-    def _beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
-        """Patterns that are needed, and the scores of everything with those as nuisances."""
+    def beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
+        """Patterns that together leave nothing significant, with corrected p, the most probable first, one by one; and
+        the scores of everything with those as nuisances."""
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
         while len(needed) < thresholds.MOST_PATTERNS:
-            clear = [s for s in map(table.__getitem__, names) if s.testable and self._p(s) < thresholds.ALARM]
+            clear = [
+                s
+                for s in map(table.__getitem__, names)
+                if s.testable and self.table.corrected(s) < thresholds.ALARM
+            ]
             if not clear:
                 break
             best = max(clear, key=lambda s: s.log_bayes)
-            needed.append((best.name, self._p(best)))
+            needed.append((best.name, self.table.corrected(best)))
             names.remove(best.name)
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
             table = space.table_after(self.table, scores)
         return needed, table
-
-    def patterns_needed(self) -> list[tuple[str, float]]:
-        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
-        return self._beside_patterns[0]
 
     def stands(self, probes: Sequence[Probe], evidence: float, *, fitted: bool = False) -> bool:
         """True if an explanation with this evidence is preferred over every unnamed pattern.
@@ -227,10 +219,8 @@ class Evidence:
         """
         if evidence > self.best_pattern(fitted=fitted) - thresholds.EVEN_ODDS:
             return True
-        table = self._beside_patterns[1]
-        return any(
-            self._p(table[probe.name]) < thresholds.ALARM for probe in probes if table[probe.name].testable
-        )
+        scores = (self.beside_patterns[1][probe.name] for probe in probes)
+        return any(self.is_clear(s) for s in scores)
 
     def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
         """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
@@ -246,9 +236,7 @@ class Evidence:
             table=space.table_after(self.table, scores),
             probes=[p for p in self.probes if p.effect is not effect or effect is Described],
             sentences=[probe for probe in self.sentences if probe is not item.probe],
-            parts=[
-                (probe, {kind for kind in effects if kind is not effect}) for probe, effects in self.parts
-            ],
+            parts=[(probe, set(effects) - {effect}) for probe, effects in self.parts],
             chi2=self.chi2 - item.score.statistic * (self.table.noise_scale * self.scale) ** 2,
             dof=self.dof - item.score.rank,
         )
@@ -268,11 +256,7 @@ class Evidence:
 
     def nearest(self, by_candidate: Mapping[str, float]) -> dict[str, float]:
         """The smallest number of each effect among those of its probes."""
-        nearest: dict[str, float] = {}
-        for probe in self.probes:
-            effect = probe.effect.name
-            nearest[effect] = min(by_candidate[probe.name], nearest.get(effect, np.inf))
-        return nearest
+        return smallest((probe.effect.name, by_candidate[probe.name]) for probe in self.probes)
 
     def close(self, item: Ranked) -> tuple[str, ...]:
         """Effects indistinguishable from a candidate, by linear steps; the nearest first."""
@@ -289,11 +273,10 @@ class Evidence:
         least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
         length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
         alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        rivals = [r for r in self.ranked_sentences if r.log_bayes > least or r.probe.name in alike]
-        rivals = [
-            r for r in rivals if r.probe is not item.probe and not set(own) & set(sentences_of(r.probe))
-        ]
-        return tuple(r.probe.name for r in rivals[: thresholds.MOST_CLASSES])
+        rivals = (r for r in self.ranked_sentences if r.log_bayes > least or r.probe.name in alike)
+        others = (r.probe for r in rivals if r.probe is not item.probe)
+        names = [probe.name for probe in others if not set(own) & set(sentences_of(probe))]
+        return tuple(names[: thresholds.MOST_CLASSES])
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
@@ -314,8 +297,8 @@ class Evidence:
         """Rows of a file: effects indistinguishable from each significant one, by linear steps."""
         for item in self.significant[: thresholds.MOST_CLASSES]:
             if close := self.close(item):
-                effect = item.effect
-                yield {"effect": effect.name, "equivalent": close, "separated_by": effect.separated_by}
+                separated_by = item.effect.separated_by
+                yield {"effect": item.effect.name, "equivalent": close, "separated_by": separated_by}
 
     def summary(self) -> tuple[tuple[str, float, float], ...]:
         """Effects with score and corrected p, most significant first."""
@@ -325,17 +308,23 @@ class Evidence:
     def limits(self) -> Iterator[dict[str, Any]]:
         """Rows of a file: upper limits on each effect with a single amplitude."""
         for item in self.ranked:
-            names = item.effect.amplitudes()
-            if len(item.score.amplitudes) != 1 or sum(p.effect is item.effect for p in self.probes) > 1:
+            effect, (name, *_) = item.effect, item.effect.amplitudes()
+            if len(item.score.amplitudes) != 1 or sum(p.effect is effect for p in self.probes) > 1:
                 continue
             value, sigma = float(item.score.amplitudes[0]), float(np.sqrt(item.score.covariance[0, 0]))
-            unit = item.effect.numbers()[names[0]].unit
-            one_sided = names[0] in item.effect.one_sided
-            below = upper_limit(value, sigma, one_sided=one_sided)
+            below = upper_limit(value, sigma, one_sided=name in effect.one_sided)
             yield {
-                "effect": item.effect.name, "parameter": names[0], "unit": unit,
+                "effect": effect.name, "parameter": name, "unit": effect.numbers()[name].unit,
                 "value": value, "sigma": sigma, "below_95": below,
             }  # fmt: skip
+
+
+def smallest(pairs: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """The smallest number of each name."""
+    least: dict[str, float] = {}
+    for name, value in pairs:
+        least[name] = min(value, least.get(name, np.inf))
+    return least
 
 
 def explains(chi2: float, dof: float) -> bool:
@@ -417,22 +406,19 @@ def examine(
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
-        computed = collections.ChainMap(*all_candidates(design.columns, inactive, listed))
+        computed = all_candidates(design.columns, [*inactive, *listed])
     probes = [probe for probe in inactive if probe.name in computed]
     sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
-    parts = [
-        (probe, {effect for effect in effects if effect.name not in active})
-        for probe, effects in hypotheses.parts
-        if probe.name in computed
-    ]
+    holders = [(p, {kind for kind in kinds if kind.name not in active}) for p, kinds in hypotheses.parts]
+    parts = [(probe, kinds) for probe, kinds in holders if probe.name in computed]
     patterns = [
         dataclasses.replace(item, columns=item.columns.astype(np.float32))
         for item in map(design.measured.candidate, strata(design.measured))
     ]
     of_probes = [computed[probe.name] for probe in (*probes, *sentences, *(probe for probe, _ in parts))]
     candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
-    names, widths = list(candidates), [candidate.widths for candidate in candidates.values()]
-    columns = [candidate.columns for candidate in candidates.values()]
+    names = list(candidates)
+    widths, columns = zip(*((c.widths, c.columns) for c in candidates.values()), strict=True)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
     bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
@@ -473,7 +459,6 @@ def most_points(calset: CalibrationSet, instrument: Instrument, amplitudes: int)
 
     `amplitudes` counts those of all candidates.
     """
-    columns = amplitudes + number_of_columns(calset, instrument)
     exposures = len(calset.exposures)
-    numbers = exposures * calset.cameras * columns
+    numbers = exposures * calset.cameras * (amplitudes + number_of_columns(calset, instrument))
     return max(1, min(limits.DIAGNOSED_ROWS // exposures, limits.DIAGNOSED_NUMBERS // numbers))

@@ -44,6 +44,7 @@ Table = Mapping[str, Shaped[np.ndarray, " _"]]
 PointMap = Float[np.ndarray, "p k"]
 PerCamera = Mapping[str, Float[np.ndarray, "_ k"]]
 
+_OF_EXPOSURES = ("EXPOSURE", "KIND", "MJD", "CLP_ANGLE")
 _SIGMA = "(data - model) in standard deviations, a value for each camera"
 _CAMERAS = Column("float", width=None)
 _TABLES: Mapping[str, Mapping[str, tuple[Column, str]]] = {
@@ -215,7 +216,7 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
     return DiagnosisFigureData(
         points=Points(*(field[name][first] for name in ("POINT", "X", "Y"))),
-        exposures={name: curves[name][rows] for name in ("EXPOSURE", "KIND", "MJD", "CLP_ANGLE")},
+        exposures={name: curves[name][rows] for name in _OF_EXPOSURES},
         ladder=tables["LADDER"],
         shares=tables["SHARES"],
         comparisons=tuple(comparisons),
@@ -260,19 +261,13 @@ def figure_data(diagnosis: Diagnosis) -> DiagnosisFigureData:
     if _unnamed_term(diagnosis):
         pairs.append((FreeForm.name, pairs[-1][2] if diagnosis.steps else before, after))
     angle = np.where(exposures.clp_in, exposures.clp_angle, np.nan)
+    columns = exposures.exposure, exposures.kind, exposures.mjd, angle
     return DiagnosisFigureData(
         points=final.calset.points,
-        exposures={
-            "EXPOSURE": exposures.exposure,
-            "KIND": exposures.kind,
-            "MJD": exposures.mjd,
-            "CLP_ANGLE": angle,
-        },
+        exposures=dict(zip(_OF_EXPOSURES, columns, strict=True)),
         ladder=_ladder(diagnosis),
         shares=_shares(final.likelihood, before, after),
-        comparisons=tuple(
-            compare_residuals(name, first, second, used, exposures) for name, first, second in pairs
-        ),
+        comparisons=tuple(compare_residuals(*pair, used, exposures) for pair in pairs),
     )
 
 
@@ -358,18 +353,14 @@ def _ladder(diagnosis: Diagnosis) -> Table:
 
 def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Table:
     """Sums of squared residuals by camera, kind, filter and exposure."""
-    e = likelihood.calset.exposures
-    names = likelihood.model.template.cameras.names
+    e, names = likelihood.calset.exposures, likelihood.model.template.cameras.names
     share = likelihood.data_per_row / len(names)
     expected = (likelihood.used.sum(axis=0) * share)[:, None] * np.ones(len(names))
-    squares = [expected, (before**2).sum(axis=0), (after**2).sum(axis=0)]  # (exposure, camera)
-    members: list[tuple[str, str]] = []
-    sums: list[list[float]] = []
-    for k, camera in enumerate(names):
-        members.append(("camera", camera))
-        sums.append([float(square[:, k].sum()) for square in squares])
+    squares = np.stack([expected, (before**2).sum(axis=0), (after**2).sum(axis=0)])  # (…, exposure, camera)
+    rows = [("camera", camera, *squares[..., k].sum(axis=1)) for k, camera in enumerate(names)]
     for group, label in (("kind", e.kind), ("filter", e.filter), ("exposure", e.exposure)):
-        for member in np.unique(label):
-            members.append((group, str(member)))
-            sums.append([float(square[label == member].sum()) for square in squares])
-    return dict(zip(_TABLES["SHARES"], (*np.array(members).T, *np.array(sums).T), strict=True))
+        rows += [(group, str(m), *squares[:, label == m].sum(axis=(1, 2))) for m in np.unique(label)]
+    return {
+        name: np.array(column)
+        for name, column in zip(_TABLES["SHARES"], zip(*rows, strict=True), strict=True)
+    }

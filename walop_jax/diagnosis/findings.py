@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Classes, ClassOf, Shape
+from walop_jax.diagnosis.class_product import Classes
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -51,14 +51,9 @@ def _harmonics(
     power: dict[str, float] = {}
     best, field = -1.0, pattern[:, use].sum(axis=(1, 2))
     for harmonic in HARMONICS:
-        waves = (
-            [np.ones_like(angle)] if harmonic == 0 else [np.cos(harmonic * angle), np.sin(harmonic * angle)]
-        )
-        lengths = [float(np.linalg.norm(wave)) or 1.0 for wave in waves]
-        amplitudes = [
-            np.einsum("pek,e->pk", pattern[:, use], wave / length)
-            for wave, length in zip(waves, lengths, strict=True)
-        ]
+        waves = [np.cos(harmonic * angle), np.sin(harmonic * angle)][: 2 if harmonic else 1]
+        unit = [wave / (float(np.linalg.norm(wave)) or 1.0) for wave in waves]
+        amplitudes = [np.einsum("pek,e->pk", pattern[:, use], wave) for wave in unit]
         square = float(sum((a**2).sum() for a in amplitudes))
         power[f"{harmonic}θ"] = square
         if square > best:
@@ -148,14 +143,8 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-# ------------------------------------------------------------------------------------------------------------- findings
-
 Outcome = Literal["consistent", "effect_found", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
-
-
-def _no_cube() -> Cube:
-    return np.zeros((0, 0, 4))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,8 +186,8 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
-    residual_before: Cube = dataclasses.field(default_factory=_no_cube)
-    residual_after: Cube = dataclasses.field(default_factory=_no_cube)
+    residual_before: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+    residual_after: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
 
     @property
     def confirmed(self) -> bool:
@@ -213,7 +202,7 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class Unexplained:
-    """Remainder that has no name; `term` are the blocks of the free-form term that was added for it.
+    """Remainder that has no name; `free_form` are the blocks of the free-form term that was added for it.
 
     `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
     and u of a star with p ≤ 5 %. `parts` are names that were taken out again because they explain a part only, with
@@ -223,7 +212,7 @@ class Unexplained:
     p_value: float
     description: str
     patterns: tuple[tuple[str, float], ...]
-    term: tuple[str, ...] = ()
+    free_form: tuple[str, ...] = ()
     chi2_before: float = float("nan")
     chi2_after: float = float("nan")
     change_of_qu: float = float("nan")
@@ -346,13 +335,6 @@ class Diagnosis(Drawn):
             {"VERDICT": self.verdict},
         )
 
-    def _found(self) -> str:
-        """Names of the additions to the starting model, with a note on an unidentified remainder."""
-        names = [step.effect for step in self.steps] + ["something without a name"] * (
-            self.unexplained is not None
-        )
-        return ", ".join(names) or "nothing beyond the starting model"
-
     def display(self) -> Display:
         """The verdict and the findings."""
         rows = []
@@ -362,11 +344,12 @@ class Diagnosis(Drawn):
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
+        names = [step.effect for step in self.steps] + ["something without a name"] * bool(self.unexplained)
         verdict = "not examined" if self.after.verdict is None else self.after.verdict.words
         return Display(
             title=f"Diagnosis: {self.verdict.replace('_', ' ')}; fit {verdict}",
             facts=(
-                ("found", self._found()),
+                ("found", ", ".join(names) or "nothing beyond the starting model"),
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
                 ("p of the starting model", probability(self.p_value).removeprefix("= ")),
                 ("field points", str(self.points)),
@@ -377,9 +360,6 @@ class Diagnosis(Drawn):
         )
 
 
-# --------------------------------------------------------------------------------- descriptions
-
-
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
     """The sentences of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
@@ -387,13 +367,10 @@ def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...
     effect = result.model.instrument(result.values).effect(Described.name)
     assert isinstance(effect, Described)
     index, units = result.model.index, result.model.template.units
+    sigma = (float(result.sigma[index(f"{Described.name}.{change.label}")]) for change, _ in effect.terms())
     return tuple(
-        (
-            change.counted_in(units),
-            float(amplitude),
-            float(result.sigma[index(f"{Described.name}.{change.label}")]),
-        )
-        for change, amplitude in effect.terms()
+        (change.counted_in(units), float(amplitude), error)
+        for (change, amplitude), error in zip(effect.terms(), sigma, strict=True)
     )
 
 
@@ -414,8 +391,6 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
     }
 
 
-# ------------------------------------------------------------------------------------------ as plain data
-
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
     "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
@@ -432,23 +407,6 @@ def _step(step: Step) -> dict[str, Any]:
         "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
     }
-
-
-def _members(addition: ClassOf) -> dict[str, Any]:
-    return {
-        "added": addition.added,
-        "members": [{"name": m.name, "probability": m.probability} for m in addition.members],
-        "spread_of_p": addition.spread,
-        "stated_error_of_p": addition.stated,
-        "farthest_element_sigma": addition.off,
-    }
-
-
-def _shape(shape: Shape | None) -> dict[str, Any] | None:
-    if shape is None:
-        return None
-    count = len(shape.deviations.sums)
-    return {"deviations": count, "spread_of_p": shape.spread, "stated_error_of_p": shape.stated}
 
 
 def sentences(content: Mapping[str, Any]) -> Iterator[str]:
@@ -516,29 +474,11 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:
     """The content of diagnosis.json."""
-    left, before, after = diagnosis.unexplained, diagnosis.before, diagnosis.after
-    unexplained = (
-        None
-        if left is None
-        else {
-            "p_value": left.p_value,
-            "description": left.description,
-            "patterns": [{"pattern": name, "p_value": p} for name, p in left.patterns],
-            "free_form": left.term,
-            "chi2_before": left.chi2_before,
-            "chi2_after": left.chi2_after,
-            "change_of_qu": left.change_of_qu,
-            "parts": left.parts,
-        }
-    )
-    rounds = [
-        {
-            "p_value": turn.p_value,
-            "added": turn.added,
-            "asked": [reason._asdict() for reason in turn.asked],
-        }
-        for turn in diagnosis.rounds
-    ]
+    remainder, before, after = diagnosis.unexplained, diagnosis.before, diagnosis.after
+    unexplained = None
+    if remainder is not None:
+        patterns = [{"pattern": name, "p_value": p} for name, p in remainder.patterns]
+        unexplained = dataclasses.asdict(remainder) | {"patterns": patterns}
     content = {
         "verdict": diagnosis.verdict,
         "steps": [_step(step) for step in diagnosis.steps],
@@ -553,12 +493,26 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "limits": diagnosis.limits,
         "choices": [dataclasses.asdict(choice) for choice in diagnosis.choices],
         "classes": diagnosis.classes,
-        "members": [_members(addition) for addition in diagnosis.members.additions],
-        "shape": _shape(diagnosis.members.shape),
+        "members": [
+            {
+                "added": addition.added,
+                "members": [{"name": m.name, "probability": m.probability} for m in addition.members],
+                "spread_of_p": addition.spread,
+                "stated_error_of_p": addition.stated,
+                "farthest_element_sigma": addition.off,
+            }
+            for addition in diagnosis.members.additions
+        ],
+        "shape": (shape := diagnosis.members.shape)
+        and {
+            "deviations": len(shape.deviations.sums),
+            "spread_of_p": shape.spread,
+            "stated_error_of_p": shape.stated,
+        },
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": before.chi2 / max(before.dof, 1),
         "chi2_per_dof_after": after.chi2 / max(after.dof, 1),
-        "rounds": rounds,
+        "rounds": [dataclasses.asdict(turn) for turn in diagnosis.rounds],
         "not_scored": diagnosis.not_scored,
         "descriptions": diagnosis.descriptions,
         "caution": diagnosis.caution,

@@ -13,6 +13,7 @@ Limits      One mistake at a time, one amplitude of an effect at a time, to firs
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -24,7 +25,6 @@ from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.settings import Settings
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe
@@ -71,7 +71,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     instrument = fit.model.instrument(fit.values)
     mistakes = list(_mistakes(design, singles, usual))
     along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
-    changes = (fit.model.selection() @ design.taken_up(along)).T
+    changes = (fit.model.selection() @ design.projector.taken_up(along)).T
     turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
     errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
@@ -89,6 +89,9 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     order = sorted([*always, *further], key=lambda i: -errors[i])
     acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
     selected = [mistakes[i] for i in order]
+    texts = (
+        as_text(m.effect) if (m := mistakes[i]).effect is not None and i in acting else "" for i in order
+    )
     return Hidden(
         names=tuple(m.name for m in selected),
         sizes=tuple(m.size for m in selected),
@@ -96,10 +99,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
         changes=changes[order],
         kinds=tuple(m.kind for m in selected),
         remedies=tuple(m.shown_by for m in selected),
-        acts=tuple(
-            as_text(m.effect) if m.effect is not None and i in acting else ""
-            for i, m in zip(order, selected, strict=True)
-        ),
+        acts=tuple(texts),
         measured=tuple(i not in unseen for i in order),
     )
 
@@ -124,8 +124,8 @@ def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake
             shown.add(rival.probe.name)
             yield from of_stars.effects(rival.probe, sizes, along, alive)
         else:
-            kind = EFFECT if rival.stated is None else DATA
-            number = (rival.candidate.name, kind, float(sizes[0]), rival.unit, rival.shown_by)
+            kind, size = EFFECT if rival.stated is None else DATA, float(sizes[0])
+            number = rival.candidate.name, kind, size, rival.unit, rival.shown_by
             yield _Mistake(*number, along[:, 0], bool(alive[0]))
     for probe in of_stars.asked:
         if probe.name not in shown:
@@ -142,16 +142,14 @@ class _Starlight:
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
-        columns = design.columns
-        changes = {
-            p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked
+        every = {p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked}
+        linear = {
+            name: terms for name, terms in every.items() if terms and all(map(design.columns.has, terms))
         }
-        linear = [name for name, terms in changes.items() if terms and all(map(columns.has, terms))]
-        self.vectors, added = added_to_starlight(
-            columns, [change for name in linear for change in changes[name]], exposure
-        )
-        ends = np.cumsum([len(changes[name]) for name in linear])
-        self.added = dict(zip(linear, np.split(added, ends[:-1], axis=-1), strict=True)) if linear else {}
+        changes = list(itertools.chain(*linear.values()))
+        self.vectors, added = added_to_starlight(design.columns, changes, exposure)
+        ends = np.cumsum([len(terms) for terms in linear.values()])[:-1]
+        self.added = dict(zip(linear, np.split(added, ends, axis=-1), strict=False))
 
     def effects(
         self,
@@ -201,10 +199,13 @@ def _errors_of_stars(
     fit, points = design.fit, design.fit.calset.points
     places = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
     instrument = fit.model.instrument(fit.values)
-    setting: Settings = first_setting(fit.calset, instrument, exposure)
-    matrix, slopes = matrix_slopes(
-        instrument, setting, fit.calset.filters, points.x[places], points.y[places]
+    at = (
+        first_setting(fit.calset, instrument, exposure),
+        fit.calset.filters,
+        points.x[places],
+        points.y[places],
     )
+    matrix, slopes = matrix_slopes(instrument, *at)
     errors = np.zeros(len(mistakes))
     for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
         direct = mistake.change[places] if isinstance(mistake.change, np.ndarray) else mistake.change

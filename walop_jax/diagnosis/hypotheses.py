@@ -14,11 +14,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.dependences import FEWEST_POINTS
-from walop_jax.diagnosis.score import Candidate, Score
+from walop_jax.diagnosis.score import Candidate, Score, Vector
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
@@ -28,8 +27,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS
 
 DEFAULT_WIDTH = 1.0
-
-Vector = Float[np.ndarray, " _"]
+FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,27 +38,22 @@ class Probe:
     effect: EffectKind
     group: tuple[Effect, ...]
 
-    def _fields(self) -> Iterator[str]:
-        """The parameter that each amplitude belongs to, member by member."""
-        for member in self.group:
-            for name in self.effect.amplitudes():
-                yield from [name] * np.size(getattr(member, name))
-
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the amplitudes belong to, one for each."""
-        return tuple(self._fields())
+        """Names of the parameters that the amplitudes belong to, one for each, member by member."""
+        pairs = itertools.product(self.group, self.effect.amplitudes())
+        return tuple(name for member, name in pairs for _ in range(np.size(getattr(member, name))))
 
     @functools.cached_property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
         declared = self.effect.numbers()
-        return np.array([declared[name].width or DEFAULT_WIDTH for name in self._fields()])
+        return np.array([declared[name].width or DEFAULT_WIDTH for name in self.parameters])
 
     @property
     def one_sided(self) -> Bool[np.ndarray, " _"]:
         """True for amplitudes that physics keeps above neutral, member by member."""
-        return np.array([name in self.effect.one_sided for name in self._fields()], bool)
+        return np.array([name in self.effect.one_sided for name in self.parameters], bool)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,63 +114,48 @@ def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) ->
     """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
     if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
         return False
-    exposures = calset.exposures
-    unstated = {
-        name
-        for name, column in CONDITIONS.items()
-        if not np.isfinite(getattr(exposures, column.lower())).any()
-    }
+    columns = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
+    unstated = {name for name, values in columns.items() if not np.isfinite(values).any()}
     bare = dataclasses.replace(instrument, effects=())
     return not unstated or unstated.isdisjoint(conditions_of_effect(bare, effect))
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
     """The probes of effects that a set is sensitive to; all shapes of one effect have the same requirements."""
-    shown: dict[EffectKind, bool] = {}
-    for probe in wanted:
-        if probe.effect not in shown:
-            shown[probe.effect] = _can_show(calset, instrument, probe.group[0])
-    return [probe for probe in wanted if shown[probe.effect]]
+    first = {probe.effect: probe.group[0] for probe in reversed(wanted)}
+    shown = {kind for kind, effect in first.items() if _can_show(calset, instrument, effect)}
+    return [probe for probe in wanted if probe.effect in shown]
 
 
-def all_candidates(
-    columns: Columns, effects: Sequence[Probe], sentences: Sequence[Probe]
-) -> tuple[dict[str, Candidate], dict[str, Candidate]]:
+def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candidate]:
     """Columns of effects and, in single precision, of sentences, by name.
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
-    likelihood, values = columns.likelihood, columns.values
-    template = likelihood.model.template
-    shown = showable(likelihood.calset, template, effects)
+    likelihood, template = columns.likelihood, columns.likelihood.model.template
+    effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
+    shown = [*effects, *(p for p in wanted if p.effect is Described)]
     linear: dict[str, list[Change]] = {}
-    for probe in (*shown, *sentences):
+    for probe in shown:
         members = [member.first_order(template) for member in probe.group]
         if all(terms and all(map(columns.has, terms)) for terms in members):
             linear[probe.name] = list(itertools.chain(*members))
-    gaps = {
-        name: [sentence.gap for change in sums for sentence in fringes_of(change)]
-        for name, sums in linear.items()
-    }
+    gaps = {name: [s.gap for change in sums for s in fringes_of(change)] for name, sums in linear.items()}
     survives = columns.survives(list(itertools.chain(*gaps.values())))
-    blurred = {name for name in gaps if not all(survives[gap] for gap in gaps[name])}
-    linear = {name: sums for name, sums in linear.items() if name not in blurred}
-    exact = sum(len(linear.get(probe.name, ())) for probe in shown)
-    computed = columns.rounded(list(itertools.chain(*linear.values())), exact)
-    candidates: list[dict[str, Candidate]] = []
-    for listed, block in zip((shown, sentences), computed, strict=True):
-        sizes = [len(linear[probe.name]) for probe in listed if probe.name in linear]
-        blocks = iter(np.split(block, np.cumsum(sizes)[:-1], axis=1))
-        candidates.append({
-            probe.name: Candidate(
-                probe.name,
-                next(blocks) if probe.name in linear else own_columns(likelihood, values, probe.group),
-                probe.widths,
-            )
-            for probe in listed
-            if probe.name not in blurred
-        })  # fmt: skip
-    return candidates[0], candidates[1]
+    shown = [probe for probe in shown if all(survives[gap] for gap in gaps.get(probe.name, ()))]
+    linear = {probe.name: linear[probe.name] for probe in shown if probe.name in linear}
+    exact = sum(len(linear.get(probe.name, ())) for probe in effects)
+    blocks = columns.rounded(list(itertools.chain(*linear.values())), exact)
+    used, candidates = [0, 0], {}
+    for probe in shown:
+        if probe.name in linear:
+            single = int(probe.effect is Described)
+            first, used[single] = used[single], used[single] + len(linear[probe.name])
+            block = blocks[single][:, first : used[single]]
+        else:
+            block = own_columns(likelihood, columns.values, probe.group)
+        candidates[probe.name] = Candidate(probe.name, block, probe.widths)
+    return candidates
 
 
 def fringes_of(change: Change) -> Iterator[Sentence]:

@@ -20,12 +20,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import operator
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from walop_jax.data.kinds import POLARISER
-from walop_jax.data.records import CalibrationSet, Exposures, Points, Position
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Points, Position
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.fit.base_model import base_model, model_like
@@ -68,16 +69,13 @@ class Alternative:
 
 def refuse_mixups(result: FitResult) -> None:
     """Raise `DataError` with the remedy if another reading of its data explains the residuals of a fit."""
-    alternatives = mixups_of(result)
-    if alternatives:
+    if alternatives := mixups_of(result):
         raise refusal(result, alternatives)
 
 
 def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
     """The readings of the data that explain the residuals of a fit, best first."""
-    if result.dof <= 0:
-        return ()
-    return mixups(result.calset, result.model, result.chi2 / result.dof)
+    return mixups(result.calset, result.model, result.chi2 / result.dof) if result.dof > 0 else ()
 
 
 def refusal(result: FitResult, alternatives: Sequence[Alternative]) -> DataError:
@@ -112,18 +110,14 @@ def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternati
     of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
     for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
         tried = [_judged(item, few, model, left, _STEPS[0]) for item in readings]
-        best = [_judged(item, few, model, item.explained, _STEPS[1]) for item in _sorted(tried)[:_BEST]]
-        enough = min(1.0 + (left - 1.0) / thresholds.READING_GAIN, FAR_OFF)
-        good = [item for item in _sorted(best) if item.explained < enough]
+        tried = sorted(tried, key=lambda item: item.explained)[:_BEST]
+        best = [_judged(item, few, model, item.explained, _STEPS[1]) for item in tried]
+        enough = min(1.0 + (left - 1.0) / thresholds.PART, FAR_OFF)
+        good = sorted((item for item in best if item.explained < enough), key=lambda item: item.explained)
         if good:
-            return tuple(
-                item for item in good if item.explained < thresholds.READING_ALIKE * good[0].explained
-            )
+            alike = thresholds.READING_ALIKE * good[0].explained
+            return tuple(item for item in good if item.explained < alike)
     return ()
-
-
-def _sorted(alternatives: list[Alternative]) -> list[Alternative]:
-    return sorted(alternatives, key=lambda item: item.explained)
 
 
 def _judged(
@@ -244,9 +238,9 @@ def refuse_dead_cameras(result: FitResult) -> None:
     calset = result.calset
     block = calset.intensities.block(0, min(len(calset.points), _FEW))
     repeated = block.used.sum(axis=0) > 1
-    counts = np.where(block.used[..., None], block.counts, np.nan)[:, repeated]
     if not repeated.any():
         return
+    counts = np.where(block.used[..., None], block.counts, np.nan)[:, repeated]
     still = np.nanmax(counts, axis=(0, 1)) == np.nanmin(counts, axis=(0, 1))
     if still.any():
         names = ", ".join(np.array(result.model.template.cameras.names)[still])
@@ -272,16 +266,19 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
         yield Alternative(
             f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
             "leave them out, or reduce them again",
-            lambda calset, off=off: _without_exposures(calset, off),
+            _with_block(lambda b, off=off: {"used": b.used & ~np.isin(np.arange(b.used.shape[1]), off)}),
         )
 
 
-def _without_exposures(calset: CalibrationSet, off: np.ndarray) -> CalibrationSet:
-    intensities = calset.intensities.block(0, len(calset.points))
-    used = intensities.used.copy()
-    used[:, off] = False
-    block = dataclasses.replace(intensities, used=used)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+def _with_block(change: Callable[[Block], dict[str, np.ndarray]]) -> Change:
+    """A set with other intensities: `change` gives the arrays that differ."""
+
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        block = calset.intensities.block(0, len(calset.points))
+        block = dataclasses.replace(block, **change(block))
+        return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+
+    return changed
 
 
 def _exchanged(calset: CalibrationSet, pair: tuple[int, int]) -> CalibrationSet:
@@ -300,15 +297,16 @@ def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.
     return change
 
 
-def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+def with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """A set with another column of its exposures."""
     return with_exposures(lambda e: dataclasses.replace(e, **{column: turn(getattr(e, column))}))
 
 
-def _with_site(name: str) -> Change:
-    """The set with a coordinate of the site of the other sign."""
+def with_site(name: str, turn: Callable[[float], float]) -> Change:
+    """A set with another longitude or latitude of the site."""
 
     def change(calset: CalibrationSet) -> CalibrationSet:
-        site = dataclasses.replace(calset.site, **{name: -getattr(calset.site, name)})
+        site = dataclasses.replace(calset.site, **{name: turn(float(getattr(calset.site, name)))})
         return dataclasses.replace(calset, site=site)
 
     return change
@@ -350,7 +348,7 @@ def _orders(model: Model) -> Iterator[Alternative]:
         yield Alternative(
             f"the columns of N were in the order {held}",
             f"their order is {', '.join(names)}",
-            lambda calset, order=order: _with_cameras(calset, list(order)),
+            _with_cameras(list(order)),
         )
 
 
@@ -399,12 +397,8 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
             )
 
 
-def _with_cameras(calset: CalibrationSet, order: list[int]) -> CalibrationSet:
-    intensities = calset.intensities.block(0, len(calset.points))
-    block = dataclasses.replace(
-        intensities, counts=intensities.counts[..., order], sigma=intensities.sigma[..., order]
-    )
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+def _with_cameras(order: list[int]) -> Change:
+    return _with_block(lambda b: {"counts": b.counts[..., order], "sigma": b.sigma[..., order]})
 
 
 def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
@@ -440,22 +434,22 @@ _TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Chang
     ("Q and U of SOURCES are in per cent", "give fractions", _has_stars,
      _with_sources(lambda q, u: (q / 100.0, u / 100.0))),
     ("ROTATOR runs the other way", "correct it (docs: conventions)", _has_rotator,
-     _with_column("rotator", lambda a: -a)),
+     with_column("rotator", operator.neg)),
     ("ROTATOR is 90° too small", "correct it (docs: conventions)", _has_rotator,
-     _with_column("rotator", lambda a: a + 90.0)),
-    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, _with_column("rotator", np.rad2deg)),
-    ("RA is in hours", _AT, _below("ra", 24.0), _with_column("ra", lambda a: 15.0 * a)),
-    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), _with_column("ra", np.rad2deg)),
-    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), _with_column("dec", np.rad2deg)),
+     with_column("rotator", lambda a: a + 90.0)),
+    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, with_column("rotator", np.rad2deg)),
+    ("RA is in hours", _AT, _below("ra", 24.0), with_column("ra", lambda a: 15.0 * a)),
+    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), with_column("ra", np.rad2deg)),
+    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), with_column("dec", np.rad2deg)),
     ("RA and DEC are exchanged", "exchange them", _below("ra", 90.0),
      with_exposures(lambda e: dataclasses.replace(e, ra=np.mod(e.dec, 360.0), dec=e.ra))),
-    ("DEC has the other sign", "give −DEC", _has_moon, _with_column("dec", lambda a: -a)),
+    ("DEC has the other sign", "give −DEC", _has_moon, with_column("dec", operator.neg)),
     *(
         (f"MJD is {abs(days):g} d too {'large' if days > 0 else 'small'}",
-         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, _with_column("mjd", lambda t, d=days: t - d))
+         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, with_column("mjd", lambda t, d=days: t - d))
         for days in (0.5, -0.5, 1.0, -1.0)
     ),
-    ("SITELONG has the other sign", "east is positive", _has_moon, _with_site("longitude")),
-    ("SITELAT has the other sign", "north is positive", _has_moon, _with_site("latitude")),
+    ("SITELONG has the other sign", "east is positive", _has_moon, with_site("longitude", operator.neg)),
+    ("SITELAT has the other sign", "north is positive", _has_moon, with_site("latitude", operator.neg)),
 )  # fmt: skip
 """Readings of sky and standards: what must have happened, what to do, the sets it can have happened to, the cure."""

@@ -12,8 +12,14 @@ from walop_jax.diagnosis.design import held_out, strata
 from walop_jax.diagnosis.exact import Trial, evidence_of_presence, try_effect
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Unexplained, describe
-from walop_jax.diagnosis.predictions import predicts_unseen
-from walop_jax.diagnosis.refits import Refits, contradicting, refitted_in_order, settled, without
+from walop_jax.diagnosis.refits import (
+    Refits,
+    contradicting,
+    predicts_unseen,
+    refitted_in_order,
+    settled,
+    without,
+)
 from walop_jax.diagnosis.search import State
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood import limits
@@ -31,7 +37,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     if state.steps and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
-    added = _descriptions(state)
+    added = tuple(name for step in state.steps for name in step.groups)  # groups of sentences
     if remainder is not None:
         against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
@@ -84,9 +90,6 @@ def _refitted(first: State, state: State, result: FitResult, steps: Sequence[Tri
     return dataclasses.replace(state, steps=tuple(in_order))
 
 
-# ------------------------------------------------------------------------------------------- remainder
-
-
 def _leftover(first: State, state: State, judge: Refits) -> Remainder:
     """Remainder of a state, with a free-form term for it where that is of use."""
     partial: tuple[str, ...] = ()
@@ -122,17 +125,13 @@ def _parts(first: State, state: State) -> dict[str, str]:
     Such a name explains no more than it can borrow from missing effects, and the matrix between the points is worse
     with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
     """
-    names = [step for step in state.steps if step.effect is not OtherDescription]
-    remaining, missing = (
-        fit.chi2 / max(fit.dof, 1) - 1.0 for fit in (state.evidence.result, first.evidence.result)
-    )
-    if not names or remaining < thresholds.POOR_FIT - 1.0 or remaining * thresholds.PART < missing:
+    results, freedom = (state.evidence.result, first.evidence.result), max(first.evidence.dof, 1)
+    remaining, missing = (result.chi2 / max(result.dof, 1) - 1.0 for result in results)
+    if remaining < thresholds.POOR_FIT - 1.0 or remaining * thresholds.PART < missing:
         return {}
     partial = {}
-    for step in names:
-        before, after = (
-            step.compared[f"chi2_{when}"] / max(first.evidence.dof, 1) for when in ("before", "after")
-        )
+    for step in (step for step in state.steps if step.effect is not OtherDescription):
+        before, after = (step.compared[f"chi2_{when}"] / freedom for when in ("before", "after"))
         partial[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
     return partial
 
@@ -141,7 +140,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     """Remainder, and a fit with a free-form term for it (None: it would be of no use)."""
     evidence = state.evidence
     result, measured = evidence.result, evidence.design.measured
-    patterns = tuple(evidence.patterns_needed())
+    patterns = tuple(evidence.beside_patterns[0])
     remainder = _unexplained(evidence, patterns)
     blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.candidates[name].block))
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
@@ -150,9 +149,8 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
         return remainder, None
     # A block has all patterns of its kind: those that are not needed cost errors as well.
     terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
-    useful = tuple(
-        block for block in blocks if predicts_unseen(evidence.design, terms[block], thresholds.USEFUL)
-    )
+    design = evidence.design
+    useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
     if not useful:
         return _and(remainder, _LEFT_OUT), None
     trial = try_effect(result, FreeForm.of(judge.context, blocks=useful), judge.context)
@@ -161,7 +159,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     after = settled(trial.fit, [step.effect.name for step in state.steps])
     change = largest_change(instrument_matrices(result), instrument_matrices(after))
     remainder = dataclasses.replace(
-        remainder, term=useful, chi2_before=result.chi2, chi2_after=after.chi2, change_of_qu=change
+        remainder, free_form=useful, chi2_before=result.chi2, chi2_after=after.chi2, change_of_qu=change
     )
     return remainder, after
 
@@ -203,14 +201,12 @@ def _worse(first: Examination, last: Examination) -> str:
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     """The first model again: the additions are reported as parts."""
-    partial = tuple(
-        f"{step.effect.name} (χ² {step.compared['chi2_before']:.4g} → {step.compared['chi2_after']:.4g})"
-        for step in state.steps
-    )
+    changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
+    partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     text = (
         f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(partial)}"
     )
-    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.patterns_needed())), text)
+    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.beside_patterns[0])), text)
     remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder
 
@@ -223,11 +219,6 @@ def back_to(first: State, state: State) -> State:
 def _contradicted(state: State) -> dict[str, str]:
     """All candidates contradicted by exposures of another KIND, in words."""
     return {r.name: f"{r.name} ({r.reason})" for turn in state.rounds for r in turn.asked if r.against}
-
-
-def _descriptions(state: State) -> tuple[str, ...]:
-    """Names of the added groups of sentences."""
-    return tuple(name for step in state.steps for name in step.groups)
 
 
 _LEFT_OUT = (

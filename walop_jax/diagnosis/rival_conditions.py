@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import special
@@ -11,7 +11,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import log_evidence_ratio
 from walop_jax.diagnosis.score import corrected_p, local_p
-from walop_jax.diagnosis.stated_conditions import ALIKE, condition_in_words, condition_scores
+from walop_jax.diagnosis.stated_conditions import ALIKE, ScoredNumber, condition_in_words, condition_scores
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.likelihood import Likelihood
@@ -19,38 +19,33 @@ from walop_jax.likelihood.likelihood import Likelihood
 _FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of each
 
 
-def rival_conditions(design: Design, chi2: float) -> Iterator[str]:
+def rival_conditions(design: Design, conditions: Sequence[ScoredNumber], chi2: float) -> Iterator[str]:
     """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
 
-    `design` is of the fit before anything was added to its model.
+    `design` is of the fit before anything was added to its model, `conditions` are its `condition_scores`.
     """
-    scored = [item for item in condition_scores(design) if item.score.testable]
+    scored = [item for item in conditions if item.score.testable]
     square = float(np.sum(design.projector(design.residual) ** 2))
     least = special.chdtri(1, local_p(thresholds.ALARM, len(scored))) if scored else np.inf
-    gains = [float(item.score.amplitudes[0]) ** 2 * item.square for item in scored]
-    alike = [
-        (gain, item)
-        for gain, item in zip(gains, scored, strict=True)
-        if square - gain < chi2 + ALIKE and gain > least
-    ]
+    gains = [(float(item.score.amplitudes[0]) ** 2 * item.square, item) for item in scored]
+    alike = [(gain, item) for gain, item in gains if square - gain < chi2 + ALIKE and gain > least]
     if alike:
         alike.sort(key=lambda pair: -pair[0])
-        causes = "; or ".join(
-            condition_in_words(item.stated, item.score) for _, item in alike[: thresholds.SHOWN]
-        )
+        shown = alike[: thresholds.SHOWN]
+        causes = "; or ".join(condition_in_words(item.stated, item.score) for _, item in shown)
         yield f"what was found explains no more than one number that the set states would, if it were {causes}"
 
 
-def instead_of_names(before: FitResult, after: FitResult) -> str:
+def instead_of_names(conditions: Sequence[ScoredNumber], before: FitResult, after: FitResult) -> str:
     """The number that the set states which, if wrong, explains the data better than names do; empty: none.
 
-    Numbers that are as probable are reported together. Where nothing was added (`after` is `before`) only what explains
-    the data is reported.
+    `conditions` are the `condition_scores` of `before`. Numbers that are as probable are reported together. Where
+    nothing was added (`after` is `before`) only what explains the data is reported.
 
     Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
     with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
     """
-    listed = [c for c in condition_scores(Design.of(before)) if c.score.testable]
+    listed = [c for c in conditions if c.score.testable]
     listed = [c for c in listed if corrected_p(c.score.log_p, len(listed)) < thresholds.ALARM]
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)

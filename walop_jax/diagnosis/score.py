@@ -26,7 +26,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -64,7 +64,7 @@ class Candidate:
     name: str
     columns: Matrix
     widths: Vector
-    block: str | None = None
+    block: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,12 +94,17 @@ class Projector:
     """
 
     def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
-        self.basis, _ = np.linalg.qr(unit_columns(jacobian)[0])
+        self._jacobian, self.basis = jacobian, np.linalg.qr(unit_columns(jacobian)[0])[0]
         self.free = jacobian.shape[0] - jacobian.shape[1] - eliminated
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """Project columns: to 10⁻¹⁵ of their length, where a part of 10⁻³ counts (`ABSORBED`, of the square)."""
         return columns - self.basis @ (self.basis.T @ columns)
+
+    def taken_up(self, along: Float[np.ndarray, "q ..."]) -> Float[np.ndarray, "f ..."]:
+        """Change R⁻¹QᵀC of the parameters, J = QR, at first order, by changes C of the rows; `along` is QᵀC."""
+        unit, norm = unit_columns(self._jacobian)
+        return (np.linalg.lstsq(self.basis.T @ unit, along, rcond=None)[0].T / norm).T
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,18 +123,14 @@ class ScoreTable:
     def _by_name(self) -> Mapping[str, Score]:
         return {score.name: score for score in self.scores}
 
-    @property
-    def ranked(self) -> tuple[Score, ...]:
-        """Testable candidates, smallest local p first."""
-        return tuple(sorted((s for s in self.scores if s.testable), key=lambda s: s.log_p))
-
     def corrected(self, score: Score) -> float:
         """p of a candidate corrected for the number of candidates tried."""
         return corrected_p(score.log_p, self.trials)
 
     def significant(self, alarm: float, most: int) -> tuple[str, ...]:
         """Names of up to `most` candidates with a corrected p below `alarm`, the smallest first."""
-        return tuple(score.name for score in self.ranked if self.corrected(score) < alarm)[:most]
+        ranked = sorted((s for s in self.scores if s.testable), key=lambda s: s.log_p)
+        return tuple(score.name for score in ranked if self.corrected(score) < alarm)[:most]
 
     def local(self, p: float) -> float:
         """The local p that the smallest of all candidates undercuts with probability `p` under the base."""
@@ -213,14 +214,7 @@ class ScoreSpace:
             products += gram(remainder, exact)
         for at, square in zip(places, alone, strict=True):
             products[at, at] = square
-        return cls(
-            names=tuple(names),
-            sizes=tuple(sizes),
-            widths=np.concatenate(widths),
-            before=before,
-            gram=products,
-            free=projector.free,
-        )
+        return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, products, projector.free)
 
     def places(self) -> dict[str, slice]:
         """Slices of the amplitudes, by candidate."""
@@ -292,9 +286,7 @@ class ScoreSpace:
         """The table from s = C̃ᵀr and r·r, both behind the projection; `smallest` are draws of `smallest_p`."""
         noise_square = max(square - self._root.explained(scores), 0.0)
         freedom = self.free - self._root.rank
-        if (
-            freedom < LEAST_REST * self.free
-        ):  # candidates that could explain anything say nothing of the noise
+        if freedom < LEAST_REST * self.free:  # candidates that could explain anything do not show the noise
             noise_square, freedom = square, self.free
         noise = float(np.sqrt(noise_square / max(freedom, 1))) or 1.0
         table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
@@ -428,19 +420,11 @@ def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[n
     pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
 
     def product(pair: tuple[slice, slice]) -> None:
-        left_piece, right_piece = pair
-        source = columns if exact is None or right_piece.stop <= exact else single
-        products[left_piece, right_piece] = source[:, left_piece].T @ source[:, right_piece]
-        products[right_piece, left_piece] = products[left_piece, right_piece].T
+        first, second = pair
+        source = columns if exact is None or second.stop <= exact else single
+        products[first, second] = source[:, first].T @ source[:, second]
+        products[second, first] = products[first, second].T
 
-    _on_all_cores(
-        product,
-        [(left_piece, right_piece) for i, left_piece in enumerate(pieces) for right_piece in pieces[i:]],
-    )
-    return products
-
-
-def _on_all_cores(work: Callable[..., None], pieces: Iterable[object]) -> None:
     with ThreadPoolExecutor(cores()) as pool:
-        for _ in pool.map(work, pieces):
-            pass
+        list(pool.map(product, itertools.combinations_with_replacement(pieces, 2)))
+    return products

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,8 @@ MOST_LISTED = 40
 """Candidates of a kind that a round lists without having tried them."""
 
 
-class Reason(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Reason:
     """One candidate in a round: its evidence (ln B), corrected p, whether it was fitted, and why it was not added.
 
     `against` are KINDs of exposures that speak against it.
@@ -152,9 +153,6 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
     return refused(evidence, dataclasses.replace(trial, evidence=factor * trial.evidence, left=remaining))
 
 
-# ------------------------------------------------------------------------------------------------------ one round
-
-
 def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
     trials = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
@@ -181,16 +179,17 @@ def names_first(trial: Trial) -> float:
     return -trial.evidence + (thresholds.EVEN_ODDS if trial.effect is Described else 0.0)
 
 
+@dataclasses.dataclass(frozen=True)
 class _Log:
     """The trials of one round by name, each with the reason for which it was refused."""
 
-    def __init__(self, evidence: Evidence) -> None:
-        self.evidence, self.trials = evidence, dict[str, Trial]()
+    evidence: Evidence
+    trials: dict[str, Trial] = dataclasses.field(default_factory=dict)
 
     def passed(self, trials: Iterable[Trial], why: Any = refused) -> list[Trial]:
         """The trials that are not refused; all are noted."""
         judged = [dataclasses.replace(trial, refused=why(self.evidence, trial)) for trial in trials]
-        self.trials |= {trial.name: trial for trial in judged}
+        self.trials.update((trial.name, trial) for trial in judged)
         return [trial for trial in judged if not trial.refused]
 
 
@@ -287,7 +286,8 @@ def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Itera
     """Everything that was tried in a round, and the leading candidates that were only ranked, with the reasons."""
     table = evidence.table
     for name, trial in trials.items():
-        reason = trial.refused or ("" if name == added else _came_first(added))
+        first = f"{added} was added first" if added else "the search was broken off before it was its turn"
+        reason = trial.refused or ("" if name == added else first)
         p = table.p_global if trial.item is None else table.corrected(trial.item.score)
         yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
     for ranked in (evidence.significant, evidence.significant_sentences):
@@ -295,10 +295,6 @@ def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Itera
             if item.name not in trials:
                 reason = _too_far(evidence, item)
                 yield Reason(item.name, item.log_bayes, table.corrected(item.score), False, reason)
-
-
-def _came_first(added: str) -> str:
-    return f"{added} was added first" if added else "the search was broken off before it was its turn"
 
 
 def _too_far(evidence: Evidence, item: Ranked) -> str:

@@ -34,8 +34,8 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes, showable
-from walop_jax.diagnosis.readings import with_exposures, with_places
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes
+from walop_jax.diagnosis.readings import with_column, with_places, with_site
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
@@ -73,7 +73,7 @@ class _Stated(NamedTuple):
     along: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None
 
 
-class _Scored(NamedTuple):
+class ScoredNumber(NamedTuple):
     """A number, the score of changing it, and the derivative of the residuals (rows of the design).
 
     `square` is the square of the residual of the derivative: information, in errors as stated.
@@ -121,12 +121,7 @@ class Singles:
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
         effects = _asked_effects(design)
-        rivals = (
-            *_conditions(design),
-            *_priors(design),
-            *_of_cameras(design),
-            *_of_catalogue(design, effects),
-        )
+        rivals = *_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design, effects)
         return dataclasses.replace(scored(design, rivals), asked=effects)
 
     @property
@@ -137,15 +132,12 @@ class Singles:
 
 def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
     """Single numbers with their scores in the residuals of a design."""
-    names = [r.candidate.name for r in rivals]
-    widths = [r.candidate.widths for r in rivals]
-    columns = np.concatenate(
-        [np.zeros((len(design.residual), 0)), *(r.candidate.columns for r in rivals)], axis=1
-    )
+    matrices = [r.candidate.columns for r in rivals]
+    columns = np.concatenate([np.zeros((len(design.residual), 0)), *matrices], axis=1)
     along = design.projector.basis.T @ columns
     if not rivals:
         return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0), np.zeros(0, bool))
-    matrices = [r.candidate.columns for r in rivals]
+    names, widths = zip(*((r.candidate.name, r.candidate.widths) for r in rivals), strict=True)
     space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
@@ -196,14 +188,8 @@ def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
         candidate = Candidate(item.what, column, np.array([item.width]))
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if item.seen_by_stars else item.width
-        yield _Single(
-            candidate,
-            lambda score, item=item: condition_in_words(item, score),
-            plausible,
-            item.unit,
-            item.shown_by,
-            item,
-        )
+        wording = functools.partial(condition_in_words, item)
+        yield _Single(candidate, wording, plausible, item.unit, item.shown_by, item)
 
 
 def _priors(design: Design) -> Iterator[_Single]:
@@ -244,7 +230,6 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
         cube[..., k] = change
         column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
         rows = design.stacked([-column[measured.used].reshape(-1, 1)])
-
         name = words.format(names[k])
         wording = functools.partial(_worded, f"{name} of", unit=unit)
         return _Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
@@ -264,36 +249,26 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
 
 def _asked_effects(design: Design) -> tuple[Probe, ...]:
     """Probes of effects that the model has not; those with a place or a gap of their own are left to the patterns."""
-    fit = design.fit
-    template, calset = fit.model.template, fit.calset
+    fit, template = design.fit, design.fit.model.template
     context, excluded = (
-        effect_context(template, calset.exposures),
+        effect_context(template, fit.calset.exposures),
         (*fit.model.effect_names, *_ASKED_OTHERWISE),
     )
-    kinds = [
-        kind for kind in fit.model.catalogue if kind.name not in excluded and not set(kind.shape) & _PLACES
-    ]
+    asked = (kind for kind in fit.model.catalogue if not set(kind.shape) & _PLACES)
+    kinds = [kind for kind in asked if kind.name not in excluded]
     return tuple(probes(applicable(kinds, context, template), context))
 
 
 def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]:
     """The effects that are asked, as far as the set can show them."""
-    fit = design.fit
-    template = fit.model.template
-    testable = showable(fit.calset, template, effects)
-    named, _ = all_candidates(design.columns, testable, ())
-    for probe in (probe for probe in testable if probe.name in named):
-        rows = design.stacked([named[probe.name].columns])
-        yield _Single(
-            Candidate(probe.name, rows, probe.widths),
-            lambda score, probe=probe: _effect_in_words(probe, score, template.cameras.names),
-            probe.widths,
-            shown_by=probe.effect.revealed_by,
-            probe=probe,
-        )
+    named = all_candidates(design.columns, effects)
+    for probe in (probe for probe in effects if probe.name in named):
+        candidate = Candidate(probe.name, design.stacked([named[probe.name].columns]), probe.widths)
+        wording = functools.partial(_effect_in_words, probe, design.fit.model.template.cameras.names)
+        yield _Single(candidate, wording, probe.widths, "", probe.effect.revealed_by, None, probe)
 
 
-def _effect_in_words(probe: Probe, score: Score, cameras: Sequence[str]) -> str:
+def _effect_in_words(probe: Probe, cameras: Sequence[str], score: Score) -> str:
     effect, declared = probe.effect.combine(probe.group, score.amplitudes), probe.effect.numbers()
     if len(score.amplitudes) > thresholds.MOST_TOGETHER:
         return f"{effect.name}, {len(score.amplitudes)} numbers"
@@ -322,11 +297,11 @@ def condition_in_words(stated: _Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design, what: str = "") -> list[_Scored]:
+def condition_scores(design: Design, what: str = "") -> list[ScoredNumber]:
     """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
     singles = scored(design, tuple(_conditions(design, what)))
     return [
-        _Scored(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
+        ScoredNumber(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
         for r, info in zip(singles.rivals, singles.left, strict=True)
         if r.stated is not None
     ]
@@ -387,9 +362,7 @@ def _moved(
     calset: CalibrationSet, chosen: np.ndarray, column: str, by: float | np.ndarray, step: float
 ) -> CalibrationSet:
     """The set with a multiple of something added to a column of some of its exposures."""
-    values = getattr(calset.exposures, column)
-    values = np.where(chosen, values + step * by, values)
-    return with_exposures(lambda e: dataclasses.replace(e, **{column: values}))(calset)
+    return with_column(column, lambda values: np.where(chosen, values + step * by, values))(calset)
 
 
 def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
@@ -431,9 +404,8 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
 
 def _at_site(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
     """The set with a site farther in longitude or latitude, up to the pole."""
-    value, limit = float(getattr(calset.site, name)) + step, 90.0 if name == "latitude" else np.inf
-    site = dataclasses.replace(calset.site, **{name: float(np.clip(value, -limit, limit))})
-    return dataclasses.replace(calset, site=site)
+    limit = 90.0 if name == "latitude" else np.inf
+    return with_site(name, lambda value: float(np.clip(value + step, -limit, limit)))(calset)
 
 
 def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:

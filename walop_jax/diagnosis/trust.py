@@ -14,8 +14,8 @@ Components  the variance of what field points, exposures, states, standards, nig
             model, finer than any pattern (`variance_components`).
 Conditions  the efficient score of every number that the set states of itself: field, filters, colours, sky; of every
             prior, term of a camera and effect of the catalogue (`stated_conditions`).
-Candidates  the efficient score of every effect and description of a diagnosis (`candidate_scores`).
-Repeats     the correlation of the residuals of two exposures (`repeated_noise`).
+Candidates  the efficient score of every effect and description of a diagnosis.
+Repeats     the correlation of the residuals of two exposures (`variance_components.repeated_noise`).
 Errors      χ²/dof far below 1: N_ERR is overestimated. A few per cent are attributed to the stated errors,
             not to the model.
 
@@ -34,20 +34,20 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Bool
-from scipy import special
+from scipy import linalg, special
 
-from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.candidate_scores import candidate_scores
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
+from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
-from walop_jax.diagnosis.repeated_noise import repeated_noise
-from walop_jax.diagnosis.score import Projector, ScoreTable, local_p
+from walop_jax.diagnosis.score import Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
     found_components,
     in_words,
+    repeated_noise,
     structure_of,
     variance_components,
     with_structure,
@@ -63,6 +63,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
+TOGETHER = 1e8  # numbers in the columns of a batch of candidates
+DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
 UNEVEN = 1.25
 """Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
@@ -95,7 +97,7 @@ def examined(
     field_fit = on_field_points(result)
     if not near and (scaled := tuple(_errors_too_small(result, seed))):
         return result.judged(scaled)
-    design = Design.of(sampled(field_fit, _most(field_fit)))
+    design = Design.of(sampled(field_fit))
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
     pixels = _of_pixels(result)
@@ -108,7 +110,8 @@ def examined(
             *stated_conditions(design, singles),
             *_significant("hold patterns that noise does not make", pattern_scores(design, seed)),
             *_significant(
-                "are explained better by a missing effect", candidates or candidate_scores(design, seed)
+                "are explained better by a missing effect",
+                candidates or candidate_scores(design, seed, singles),
             ),
             *in_words(components),
             *_groups(design),
@@ -129,11 +132,53 @@ def examined(
     return dataclasses.replace(final, hidden=hidden)
 
 
+def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = None) -> ScoreTable:
+    """Scores of all effects and descriptions that a model may lack (`grammar.hypotheses`), with their corrected p.
+
+    Only products of the columns of a candidate with each other, the residuals and the projection are needed, so the
+    columns are made in batches; those of `singles` are there already. Their scores in draws of noise give the number of
+    independent trials, as in a diagnosis, so that both correct p alike.
+    """
+    fit, calset, basis, count = design.fit, design.fit.calset, design.projector.basis, design.rows
+    listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
+    absent = [probe for probe in listed.names if probe.effect.name not in fit.model.effect_names]
+    probes = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
+    known = {
+        r.candidate.name: r.candidate.columns[:count] for r in (singles.rivals if singles else ()) if r.probe
+    }
+    residual = design.projector(design.residual)
+    noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
+    normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
+    normal = design.projector(normal).astype(np.float32)
+    scored, blocks, limit = list[Probe](), [], max(1, int(TOGETHER / len(residual)))
+    batch_of = np.cumsum([len(probe.widths) for probe in probes]) // limit
+    for number in np.unique(batch_of):
+        batch = [probe for probe, of in zip(probes, batch_of, strict=True) if of == number]
+        made = all_candidates(design.columns, [probe for probe in batch if probe.name not in known])
+        for probe in batch:
+            if probe.name in known or probe.name in made:
+                c = known.get(probe.name)
+                c = made[probe.name].columns.astype(float) / fit.noise_scale if c is None else c
+                along, square = basis[:count].T @ c, c.T @ c
+                drawn = c.T.astype(np.float32) @ normal[:count]
+                scored.append(probe)
+                blocks.append((np.diag(square), c.T @ residual[:count], drawn, square - along.T @ along))
+    if not scored:
+        return ScoreTable((), noise, 1.0, 1.0)
+    before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:3])
+    names, widths = tuple(probe.name for probe in scored), [probe.widths for probe in scored]
+    gram = np.asarray(linalg.block_diag(*(block for *_, block in blocks)))
+    space = ScoreSpace(
+        names, tuple(map(len, widths)), np.concatenate(widths), before, gram, design.projector.free
+    )
+    trials = effective_trials(space.smallest_of(drawn))
+    return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
+
+
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
     """Variance components common to exposures in single pixels of whole frames, of a sample of them."""
-    if not isinstance(result.expansion, PixelExpansion):
-        return []
-    return variance_components(Design.of(sampled(result, _most(result))), pixels=True)
+    pixels = isinstance(result.expansion, PixelExpansion)
+    return variance_components(Design.of(sampled(result)), pixels=True) if pixels else []
 
 
 def _summed_pixels(result: FitResult) -> Iterator[str]:
@@ -156,10 +201,10 @@ def _summed_pixels(result: FitResult) -> Iterator[str]:
 def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
     """The structure of field points with that of the pixels that they stand for."""
     compression = result.calset.compression
-    if compression is None:
-        return structure
-    gain = np.hypot(structure.gain, compression.gain or 0.0)
-    return Structure(float(gain), float(np.hypot(structure.response, compression.response or 0.0)))
+    gain, response = (
+        (0.0, 0.0) if compression is None else (compression.gain or 0.0, compression.response or 0.0)
+    )
+    return Structure(float(np.hypot(structure.gain, gain)), float(np.hypot(structure.response, response)))
 
 
 def pixel_structure(result: FitResult) -> Structure:
@@ -167,17 +212,12 @@ def pixel_structure(result: FitResult) -> Structure:
     return structure_of(found_components(_of_pixels(result)))
 
 
-def _most(result: FitResult) -> int:
-    """Field points that are looked at."""
-    return max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
-
-
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
     """A warning if residuals far larger than the stated errors are nothing but noise."""
     factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
     scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
     field_fit = on_field_points(scaled)
-    design = Design.of(sampled(field_fit, _most(field_fit)))
+    design = Design.of(sampled(field_fit))
     rough = found_components([*variance_components(design), *_of_pixels(scaled)])
     rough = rough or any(_summed_pixels(result))
     if pattern_scores(design, seed).p_global >= thresholds.ALARM and not (rough or any(_groups(design))):
@@ -204,8 +244,9 @@ def _hold_no_noise(design: Design) -> bool:
     return float(remainder @ remainder) < NOISELESS * design.rows
 
 
-def sampled(result: FitResult, most: int) -> FitResult:
-    """The fit seen at no more than `most` field points, spread over the field."""
+def sampled(result: FitResult, most: int = 0) -> FitResult:
+    """The fit seen at no more than `most` field points (0: those of `TRUST_ROWS`), spread over the field."""
+    most = most or max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
     if len(result.calset.points) <= most:
         return result
     calset = thinned(result.calset, most, neighbours=1)

@@ -25,6 +25,19 @@ Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 8
             Biometrika 48, 419 (after Pearson 1959). Many questions: Šidák 1967
 Limits      Which place is off is not reported, only how much places differ. The mean square of the noise is taken from
             the residuals themselves, so that structure in all of them counts a little less.
+
+Is the noise of two exposures the same? The test for data that are there twice, whatever was done to them:
+
+Equation    ρ = Σ r₁·r₂ / √(Σ r₁² Σ r₂²) over the field points that two exposures share, r the residuals of each.
+            Independent noise gives Σ r₁·r₂ the variance Σ tr(P₁P₂), at most (K − f) for each point, P = 1 − ŵŵᵀ being
+            the rest of the noise of K cameras when f fluxes have been fitted
+Symbols     ŵ expected counts / errors, of unit length; p that of a normal deviate, for all pairs at once (Šidák)
+Source      correlation of independent residuals: Fisher 1915, Biometrika 10, 507
+Limits      Missing effects correlate as well, and are added to the noise: a pair is named only where ρ is more
+            than its squared residuals let a common pattern make. Below ρ = 0.25 nothing is named. Parameters take a
+            little of the noise of all exposures together, which makes ρ smaller. Exposures that share a flux are not
+            looked at. Unlike `data.repeats`, which looks for counts that agree, it needs a fit, but not many exposures,
+            and sees copies that were rescaled, interpolated or averaged.
 """
 
 from __future__ import annotations
@@ -42,6 +55,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import local_p
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Structure
+from walop_jax.io.text import some
 from walop_jax.sky.nights import night_of
 
 ALARM = 1e-3
@@ -80,11 +94,11 @@ def variance_components(design: Design, *, pixels: bool = False) -> list[Varianc
     residual = design.projector(design.residual)
     square = float(residual @ residual)
     ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design, pixels=pixels))
-    return [
-        prepared[0].answered(prepared[1][:, 0], square)
-        for prepared in ready
-        if prepared is not None and square > 0
-    ]
+    return (
+        [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
+        if square > 0
+        else []
+    )
 
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
@@ -99,10 +113,8 @@ def in_words(components: list[VarianceComponent]) -> Iterator[str]:
         return
     first = components[0]
     further = ", ".join(f"{c.grouping.name} {c.deviate:.2g} σ" for c in components[1 : 1 + thresholds.SHOWN])
-    yield (
-        f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does "
-        f"not have" + (f" (also {further})" if further else "")
-    )
+    text = f"residuals {first.grouping.words}, {first.deviate:.2g} σ: structure of {first.size:.2g} that the model does"
+    yield f"{text} not have" + (f" (also {further})" if further else "")
 
 
 def structure_of(components: list[VarianceComponent]) -> Structure:
@@ -129,7 +141,7 @@ def with_structure(
         if not component.grouping.structure or blocks is None:
             continue
         places, basis = len(blocks[0]), design.projector.basis
-        response = design.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
+        response = design.projector.taken_up(blocks[1].reshape(-1, basis.shape[1]).T)
         added += component.size**2 * response @ response.T
     share = len(design.fit.calset.points) ** 2 / (places * points)
     select = result.model.selection()
@@ -162,9 +174,8 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
         yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, stokes, "response")
     if pixels:
         return
-    positions = [
-        np.where(at.inside, at.angle, np.nan) for at in map(e.position, design.fit.likelihood.plan.moving)
-    ]
+    moving = map(e.position, design.fit.likelihood.plan.moving)
+    positions = [np.where(at.inside, at.angle, np.nan) for at in moving]
     night = night_of(e.mjd, calset.site.longitude)
     source = calset.intensities.block(0, len(points)).source
     cuts = [np.zeros(used.shape, int)]
@@ -203,10 +214,8 @@ class _Question(NamedTuple):
         deviate = 0.5 * self.error * (float(np.sum(pull**2)) / noise - self.share * self.free)
         error = noise * self.error  # of τ²
         size = float(np.sqrt(max(deviate * error, 0.0)))
-        p_value = _tail(deviate, self.skew)
-        return VarianceComponent(
-            self.grouping, deviate, p_value, size, 0.5 * error / max(size, np.sqrt(error))
-        )
+        of_size = 0.5 * error / max(size, np.sqrt(error))
+        return VarianceComponent(self.grouping, deviate, _tail(deviate, self.skew), size, of_size)
 
 
 def asked(
@@ -287,3 +296,53 @@ def _blocks(
         return None
     stacked = np.stack(found_b)
     return np.stack(found_d), stacked[..., : basis.shape[1]], stacked[..., basis.shape[1] :]
+
+
+LEAST = 0.25
+"""Correlation below which a common pattern of the optics cannot be separated from common noise."""
+
+
+def repeated_noise(design: Design) -> Iterator[str]:
+    """Sentences on exposures that hold the same noise, by their number."""
+    if pairs := pairs_alike(design):
+        number = design.fit.calset.exposures.exposure
+        listed = [f"{number[a]} and {number[b]} (correlation {alike:.2f})" for a, b, alike in pairs]
+        listed = some(listed, thresholds.SHOWN, "; ")
+        yield (
+            f"exposures hold the same noise, as independent ones never do: {listed}: remove one of each pair, "
+            "repeated data shrink the errors"
+        )
+
+
+def pairs_alike(design: Design) -> list[tuple[int, int, float]]:
+    """Pairs of exposures whose residuals hang together as only those of the same measurement do, closest first.
+
+    Their positions, and the correlation.
+    """
+    measured = design.measured
+    if measured.shared.exposures is not None:
+        return []
+    residual, used = design.cube(design.projector(design.residual)), measured.used.astype(float)
+    cameras, flux_known = residual.shape[-1], np.broadcast_to(measured.known, used.shape)[0]
+    fluxes = 1 if measured.shared.cameras is None else np.linalg.matrix_rank(measured.shared.cameras)
+    free = np.where(flux_known, cameras, cameras - fluxes)
+    product = np.einsum("pek,pfk->ef", residual, residual, optimize=True)
+    # Of two exposures the sums run over the points that both have.
+    square = np.einsum("pek,pf->ef", residual**2, used, optimize=True)
+    shared = used.T @ used
+    expected = shared * np.minimum.outer(free, free)
+    first, second = np.triu_indices(len(free), 1)
+    keep = (expected[first, second] > 0) & (square[first, second] > 0) & (square[second, first] > 0)
+    first, second = first[keep], second[keep]
+    if not len(first):
+        return []
+    first_square, second_square = square[first, second], square[second, first]
+    correlation = product[first, second] / np.sqrt(first_square * second_square)
+    # The fit takes something of every exposure: the noise is measured by the residuals.
+    deviate = correlation * np.sqrt(expected[first, second])
+    limit = -special.ndtri(local_p(thresholds.ALARM, len(first)))
+    excess = 0.5 * (first_square / free[first] + second_square / free[second]) / shared[first, second] - 1.0
+    pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
+    alike = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
+    pairs = zip(first[alike].tolist(), second[alike].tolist(), correlation[alike].tolist(), strict=True)
+    return sorted(pairs, key=lambda pair: -pair[2])

@@ -25,11 +25,9 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
-from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import (
-    Choice,
     Diagnosis,
     Outcome,
     Step,
@@ -45,6 +43,7 @@ from walop_jax.diagnosis.remainder import back_to, concluded
 from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
+from walop_jax.diagnosis.stated_conditions import condition_scores
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
@@ -109,7 +108,8 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if remainder and readings and readings[0].explained * after.dof < after.chi2:
         raise refusal(before, readings)
-    if (state.steps or remainder) and (stated := instead_of_names(before, after)):
+    conditions = condition_scores(first.evidence.design) if state.steps or remainder else []
+    if stated := instead_of_names(conditions, before, after) if conditions else "":
         partial = () if remainder is None else remainder.parts
         names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
         text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
@@ -137,7 +137,10 @@ def diagnose(
         after=after,
         seconds=time.perf_counter() - began,
         points=len(calset.points),
-        choices=tuple(sorted(state.choices.values(), key=_promise)),
+        # by the gain where it is known, then by the remaining χ²
+        choices=tuple(
+            sorted(state.choices.values(), key=lambda c: (-np.nan_to_num(c.better_by, nan=-np.inf), c.left))
+        ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=classes_of(evidence, context, set(added), groups, alike),
@@ -146,12 +149,15 @@ def diagnose(
         descriptions=len(candidates.sentences) + len(candidates.parts),
     )
     tables = first.evidence.table, evidence.table
+    rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
-    return _examined(diagnosis, tables, seed)
+    return _examined(diagnosis, tables, rivals, seed)
 
 
-def _examined(diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], seed: int) -> Diagnosis:
-    """A diagnosis with the verdicts on its fits; what a wrong statement of the set explains as well is remarked.
+def _examined(
+    diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], rivals: Sequence[str], seed: int
+) -> Diagnosis:
+    """A diagnosis with the verdicts on its fits, and the remarks on `rivals` of its names.
 
     `tables` are the scores of the fits before and after.
     """
@@ -161,7 +167,7 @@ def _examined(diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], seed:
     after = with_average(after, diagnosis.members)
     if diagnosis.before is diagnosis.after:
         return dataclasses.replace(diagnosis, before=after, after=after)
-    for sentence in rival_conditions(Design.of(diagnosis.before), diagnosis.after.chi2):
+    for sentence in rivals:
         after = after.remarked(sentence)
     # Where χ² contradicts the model given, the steps name the missing effects.
     explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
@@ -190,11 +196,6 @@ def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict
             reasons[effect.name] = "the exposures have nothing that it acts on"
     name = "it is an effect of the catalogue by another name"
     return reasons | {probe.name: name for probe in candidates.every if probe.name not in scored}
-
-
-def _promise(choice: Choice) -> tuple[float, float]:
-    """Order of other descriptions: by the gain where it is known, then by the remaining χ²."""
-    return (-choice.better_by if np.isfinite(choice.better_by) else np.inf), choice.left
 
 
 def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequence[str]) -> Step:

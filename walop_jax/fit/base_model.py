@@ -47,23 +47,15 @@ def base_model(
     sources, level = calset.sources, _level(calset)
     standards = standards_of(sources, calset.exposures, calset.filters)
     instrument = as_designed(instrument or instrument_of(calset))
-    if instrument.name != calset.instrument:
-        raise ValueError(
-            f"the data come from {calset.instrument}, the instrument described is {instrument.name}"
-        )
-    if len(instrument.cameras) != calset.cameras:
-        raise ValueError(
-            f"{instrument.name} has {len(instrument.cameras)} cameras, the data have {calset.cameras}"
-        )
+    name, cameras = instrument.name, len(instrument.cameras)
+    if name != calset.instrument:
+        raise ValueError(f"the data come from {calset.instrument}, the instrument described is {name}")
+    if cameras != calset.cameras:
+        raise ValueError(f"{name} has {cameras} cameras, the data have {calset.cameras}")
     present = Settings.of(calset.exposures, [p for p in calset.exposures.positions if p != POLARISER])
     present.check_moving(instrument.patched().moving())
-    instrument = adapted(
-        instrument,
-        standards=standards,
-        plates=plates,
-        throughput_degree=throughput_degree,
-        throughput=level,
-    )
+    choices = {"plates": plates, "throughput_degree": throughput_degree}
+    instrument = adapted(instrument, standards=standards, throughput=level, **choices)
     priors = {}
     for i, name in enumerate(standards.names):
         priors[f"standard.{name}.q"] = (float(sources.q[i]), float(sources.q_err[i]))
@@ -110,9 +102,9 @@ def gauges(model: Model, flux_known: bool) -> list[str]:
 def instrument_of(calset: CalibrationSet) -> Instrument:
     """The instrument of a set as designed, if it comes with the package; `DataError` with advice if not."""
     if calset.instrument not in shipped():
+        what = f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())})"
         raise DataError(
-            f"INSTRUME is {calset.instrument!r}, which does not come with the package ({', '.join(shipped())}): give "
-            "its description, --instrument FILE or instrument=Instrument.read(FILE)"
+            f"{what}: give its description, --instrument FILE or instrument=Instrument.read(FILE)"
         )
     return nominal_instrument(calset.instrument)
 
@@ -130,12 +122,9 @@ def model_for(
     """
 
     def build(header: ModelTable) -> Model:
-        model = base_model(
-            calset, instrument, plates=header.plates, throughput_degree=header.throughput_degree
-        )
+        model = base_model(calset, instrument, **header.of_instrument())
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        context = effect_context(model.template, calset.exposures)
-        return with_effects_of(model, header, context)
+        return with_effects_of(model, header, effect_context(model.template, calset.exposures))
 
     return parse(text, build)
 
@@ -149,7 +138,7 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
     if Deviations.name in old.effect_names:
         old = model_without(old, Deviations.name)
     header = header_of(old)
-    model = base_model(calset, old.template, plates=header.plates, throughput_degree=header.throughput_degree)
+    model = base_model(calset, old.template, **header.of_instrument())
     own_kinds = dict.fromkeys((*(effect.kind for effect in old.template.effects), *old.catalogue))
     model = dataclasses.replace(model, catalogue=tuple(own_kinds))
     model = with_effects_of(model, header, effect_context(model.template, calset.exposures))

@@ -55,54 +55,42 @@ class Misfit:
 
     def advice(self) -> tuple[str, ...]:
         """The remedy, where single rows spoil the fit."""
-        share = (
-            f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off: if these are "
-            "cosmic rays or stars, walop-jax clip flags them"
-        )
-        return (share,) if 0.0 < self.outliers <= MOST else ()
+        share = f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off"
+        advice = "if these are cosmic rays or stars, walop-jax clip flags them"
+        return (f"{share}: {advice}",) if 0.0 < self.outliers <= MOST else ()
 
     def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
         """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
         reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
         omitted = len(reasons) - MOST_REASONS
-        return (
-            *reasons[:MOST_REASONS],
-            f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}",
-        )
+        more = f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}"
+        return (*reasons[:MOST_REASONS], more)
 
     def sentences(self) -> tuple[str, ...]:
         """The disagreement in words, the largest of each kind first."""
 
-        def ranked(groups: Mapping[str, float], form: str) -> str:
+        def ranked(groups: Mapping[str, float]) -> str:
             order = sorted(groups.items(), key=lambda item: -item[1])
-            return ", ".join(f"{name} {format(value, form)}" for name, value in order)
+            return ", ".join(f"{name} {value:.3g}" for name, value in order)
 
         point, x, y, value = self.worst_point
-        moved = [
-            f"by {'calibration plate' if prefix == CALIBRATION_PLATE else f'angle of {prefix}'}: "
-            f"{ranked(groups, '.3g')}"
-            for prefix, groups in self.positions.items()
-            if set(groups) != {"out"}
-        ]
+        groups = {"kind": self.kind, "filter": self.filter}
+        for prefix, angles in self.positions.items():
+            if set(angles) != {"out"}:
+                groups["calibration plate" if prefix == CALIBRATION_PLATE else f"angle of {prefix}"] = angles
+        elements = {name: 100 * value for name, value in self.matrix_element.items()}
         return (
             *self.advice(),
-            f"mean squared residual by camera: {ranked(self.camera, '.3g')}",
-            "; ".join(
-                (f"by kind: {ranked(self.kind, '.3g')}", f"by filter: {ranked(self.filter, '.3g')}", *moved)
-            ),
-            "disagreement in the matrix, rms over field: "
-            + ranked({k: 100 * v for k, v in self.matrix_element.items()}, ".3g")
-            + " (%)",
+            f"mean squared residual by camera: {ranked(self.camera)}",
+            "; ".join(f"by {name}: {ranked(values)}" for name, values in groups.items()),
+            f"disagreement in the matrix, rms over field: {ranked(elements)} (%)",
             f"worst exposure {self.worst_exposure[0]} ({self.worst_exposure[1]:.3g}), "
             f"worst point {point} at ({x:+.3f}, {y:+.3f}) deg ({value:.3g})",
         )
 
 
 def describe(result: FitResult) -> Misfit:
-    """Group the residuals of a fit.
-
-    Of a very large set, those of `MISFIT_POINTS` points spread over the field, the worst point among them.
-    """
+    """Group the residuals of a fit; of a very large set those of `MISFIT_POINTS` points, the worst among them."""
     return misfit_at(result.likelihood, result.values)
 
 
@@ -129,6 +117,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
     per_point = square.sum(axis=(1, 2)) / np.maximum(k * used.sum(axis=1), 1)
     worst = int(per_point.argmax())
     points = likelihood.calset.points
+    x, y, value = (float(values[worst]) for values in (points.x, points.y, per_point))
     exposure = per_exposure / np.maximum(k * rows, 1)
     return Misfit(
         camera=dict(zip(names, (square.sum(axis=(0, 1)) / used.sum()).tolist(), strict=True)),
@@ -137,12 +126,7 @@ def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit
         positions={prefix: angles(at) for prefix, at in e.positions.items() if prefix != POLARISER},
         matrix_element=_matrix_elements(likelihood, residual),
         worst_exposure=(int(e.exposure[exposure.argmax()]), float(exposure.max())),
-        worst_point=(
-            int(points.point[worst]),
-            float(points.x[worst]),
-            float(points.y[worst]),
-            float(per_point[worst]),
-        ),
+        worst_point=(int(points.point[worst]), x, y, value),
         outliers=float(outlying(likelihood, residual).sum() / max(used.sum(), 1)),
     )
 
@@ -155,9 +139,8 @@ def _matrix_elements(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"
     elements = matrix_elements(len(pairs))
     squares: dict[str, list[float]] = {name: [] for name in elements}
     plate = e.position(CALIBRATION_PLATE)
-    setting = np.array(
-        [f"{f}/{a if i else 'out'}" for f, i, a in zip(e.filter, plate.inside, plate.angle, strict=True)]
-    )
+    states = zip(e.filter, plate.inside, plate.angle, strict=True)
+    setting = np.array([f"{f}/{a if i else 'out'}" for f, i, a in states])
     for label in np.unique(setting[e.clp_in]):
         use = np.flatnonzero(e.clp_in & (setting == label) & used.any(axis=0))
         if len(use) < 3:
@@ -171,9 +154,8 @@ def _matrix_elements(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"
             ok = used[:, use].all(axis=1) & (total > 0).all(axis=1)
             if not ok.any():
                 continue
-            difference = (delta[ok][:, use, first] - delta[ok][:, use, second]) / total[ok].mean(
-                axis=1, keepdims=True
-            )
+            difference = delta[ok][:, use, first] - delta[ok][:, use, second]
+            difference = difference / total[ok].mean(axis=1, keepdims=True)
             coefficients, *_ = np.linalg.lstsq(design, difference.T, rcond=None)
             for name, row in zip(names, coefficients, strict=True):
                 squares[name].extend((row**2).tolist())

@@ -41,6 +41,10 @@ class ModelTable:
     choices: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     entries: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    def of_instrument(self) -> dict[str, Any]:
+        """The choices of the base model, by name."""
+        return {"plates": self.plates, "throughput_degree": self.throughput_degree}
+
 
 def header_of(model: Model) -> ModelTable:
     """Choices that decide which parameters a model has."""
@@ -60,9 +64,8 @@ def render(model: Model) -> str:
     """The TOML text of a model."""
     header = header_of(model)
     document = tomlkit.document()
-    document.add(
-        tomlkit.comment(f"Model of {model.name}. Change what you need; delete the rest if you like.")
-    )
+    comment = f"Model of {model.name}. Change what you need; delete the rest if you like."
+    document.add(tomlkit.comment(comment))
     table = tomlkit.table()
     table["instrument"] = header.instrument
     if header.plates is not None:
@@ -94,10 +97,7 @@ def render(model: Model) -> str:
 
 
 def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
-    """The model that a TOML text describes; `build` makes the base model for its [model] table.
-
-    Raises ValueError naming the table and key that is wrong, and what to write instead.
-    """
+    """The model of a TOML text, `build` making the base model; ValueError names table, key and remedy."""
     try:
         content = parse_toml(text)
     except ValueError as error:
@@ -154,8 +154,6 @@ def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 Catalogue = Sequence[EffectKind]
-
-
 GAUGE = "throughput.n0.p00"
 
 
@@ -176,15 +174,11 @@ def model_without_data(
     design = nominal_instrument(instrument) if isinstance(instrument, str) else as_designed(instrument)
 
     def build(header: ModelTable) -> Model:
-        nominal = adapted(
-            design, standards=standards, plates=header.plates, throughput_degree=header.throughput_degree
-        )
+        nominal = adapted(design, standards=standards, **header.of_instrument())
         model = make_model(nominal.name, nominal, frozen=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
-        conditions = context or Context(
-            sources=nominal.standard.names, cameras=nominal.cameras.names, units=nominal.units
-        )
-        return with_effects_of(model, header, conditions)
+        facts = {"sources": nominal.standard.names, "cameras": nominal.cameras.names, "units": nominal.units}
+        return with_effects_of(model, header, context or Context(**facts))
 
     return parse(text, build)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.io.display import Result
+from walop_jax.io.display import Display, Result
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
@@ -59,6 +60,11 @@ class Fitted(Result):
     def to_table(self) -> Any:
         """All parameters as an astropy table: value, error, unit, start, prior, and whether it was free."""
         return parameter_table(self.model, self.values, self.sigma)
+
+    def shown(self, title: str, facts: Mapping[str, str], notes: tuple[str, ...]) -> Display:
+        """The parameters under a title, with facts about them."""
+        rows = parameter_rows(self.model, self.values, self.sigma)
+        return Display(title, tuple(facts.items()), HEAD, rows, notes)
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:

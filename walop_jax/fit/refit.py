@@ -14,7 +14,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum
-from walop_jax.fit.parameter_table import HEAD, Fitted, parameter_notes, parameter_rows
+from walop_jax.fit.parameter_table import Fitted, parameter_notes
 from walop_jax.fit.robust import robust_errors
 from walop_jax.fit.search import find_minimum
 from walop_jax.fit.verdict import (
@@ -44,9 +44,7 @@ TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something e
 PRIOR_EDGE = 4.0  # standard deviations
 EXCESS_NOISE = 0.5  # sigma
 LAYOUTS = 5  # times that wavelength nodes are laid out anew for thicker retarders
-ILL_CONDITIONED = (
-    1e6  # for each intensity: eigenvalues of data grow with their number, those of priors do not
-)
+ILL_CONDITIONED = 1e6  # for each intensity: eigenvalues of data grow with their number, not those of priors
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -183,18 +181,13 @@ class FitResult(Fitted):
     def checked_verdict(self) -> Verdict:
         """The verdict; raises RuntimeError for a fit without one."""
         if self.verdict is None:
-            raise RuntimeError(
-                "the residuals of this fit are not examined yet: call walop_jax.diagnosis.trust.examined(fit), as "
-                "walop_jax.refit and walop_jax.diagnose do"
-            )
+            what = "the residuals of this fit are not examined yet: call walop_jax.diagnosis.trust.examined(fit), as"
+            raise RuntimeError(f"{what} walop_jax.refit and walop_jax.diagnose do")
         return self.verdict
 
     @property
     def trusted(self) -> bool:
-        """True if no doubt about the fit forbids its use (`Verdict.trusted`).
-
-        Raises RuntimeError for a fit without a verdict.
-        """
+        """True if no doubt about the fit forbids its use (`Verdict.trusted`); RuntimeError without a verdict."""
         return self.checked_verdict().trusted
 
     @property
@@ -202,9 +195,8 @@ class FitResult(Fitted):
         """The sentences of the verdict; of a fit that was not examined, those on χ², priors and convergence."""
         if self.verdict is not None:
             return self.verdict.warnings
-        return tuple(
-            doubt.sentence for doubt in _against(self, (), examined=False, noiseless=False) if doubt.sentence
-        )
+        doubts = _against(self, (), examined=False, noiseless=False)
+        return tuple(doubt.sentence for doubt in doubts if doubt.sentence)
 
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
@@ -235,23 +227,7 @@ class FitResult(Fitted):
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": self.errors_from,
         }
-        return Display(
-            title=f"Fit of {self.model.name}: {verdict}",
-            facts=tuple(facts.items()),
-            head=HEAD,
-            rows=parameter_rows(self.model, self.values, self.sigma),
-            notes=(*self.notes, *self.warnings),
-        )
-
-
-def check_constrained(model: Model, expansion: Expansion) -> None:
-    """Raise ValueError for a free parameter without data and without a prior."""
-    idle = [model.parameters[i].name for i in model.free[np.diag(expansion.matrix) == 0.0]]
-    if idle:
-        raise ValueError(
-            f"nothing in the data depends on {', '.join(idle)}, free and without a prior: freeze "
-            f"{'it' if len(idle) == 1 else 'them'} or set a prior in the model file"
-        )
+        return self.shown(f"Fit of {self.model.name}: {verdict}", facts, (*self.notes, *self.warnings))
 
 
 def covariance(model: Model, expansion: Expansion) -> Matrix:
@@ -287,7 +263,10 @@ def fit(
         if likelihood is before:
             break
         best = find_minimum(likelihood, best.values, noise_scale, worth)
-    check_constrained(model, best.expansion)
+    if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
+        what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
+        them = "it" if len(idle) == 1 else "them"
+        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
     return FitResult(
         likelihood=likelihood,
         values=best.values,
@@ -315,14 +294,10 @@ def with_honest_errors(result: FitResult) -> FitResult:
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
-    robust = robust_errors(result.likelihood, result.values, result.expansion)
+    robust, made_from = robust_errors(result.likelihood, result.values, result.expansion)
     select = result.model.selection()
-    return dataclasses.replace(
-        result,
-        covariance=select @ robust.covariance @ select.T,
-        errors_from=robust.made_from,
-        verdict=None,
-    )
+    errors = select @ robust @ select.T
+    return dataclasses.replace(result, covariance=errors, errors_from=made_from, verdict=None)
 
 
 def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:
@@ -338,38 +313,28 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
     if result.minimum.condition > ILL_CONDITIONED * result.n_data:
         yield Doubt(Quality.ILL_CONDITIONED, "", blocking=False)
     if result.dof <= 0:
-        yield Doubt(
-            Quality.UNEXPLAINED | excess,
-            f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test",
-        )
+        what = f"{result.n_data} intensities for {len(result.model.free)} free parameters: nothing is left to test"
+        yield Doubt(Quality.UNEXPLAINED | excess, what)
     elif examined and not doubts and result.nearly_explains_data:
-        yield Doubt(
-            excess,
-            f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are "
-            f"{100 * (np.sqrt(ratio) - 1):.2g} % too small",
-            blocking=False,
-        )
+        what = f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are"
+        yield Doubt(excess, f"{what} {100 * (np.sqrt(ratio) - 1):.2g} % too small", blocking=False)
     elif not result.explains_data:
-        yield Doubt(
-            Quality.UNEXPLAINED | excess,
-            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this "
-            "calibration (walop-jax diagnose looks for missing effects)",
+        text = (
+            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this"
         )
+        text += " calibration (walop-jax diagnose looks for missing effects)"
+        yield Doubt(Quality.UNEXPLAINED | excess, text)
     elif result.errors_too_large and not noiseless:
-        yield Doubt(
-            Quality.ERRORS_TOO_LARGE,
-            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR holds "
-            "variances or other units",
+        what = (
+            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR"
         )
+        yield Doubt(Quality.ERRORS_TOO_LARGE, f"{what} holds variances or other units")
     elif excess:
         yield Doubt(excess, "", blocking=False)  # so few degrees of freedom that noise alone may do it
     if result.noise_scale > 1.0:
-        large = result.noise_scale**2 > 1.0 + EXCESS_NOISE**2
-        yield Doubt(
-            Quality.EXCESS_NOISE if large else Quality(0),
-            f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}: the fit is poor",
-            blocking=False,
-        )
+        bit = Quality.EXCESS_NOISE if result.noise_scale**2 > 1.0 + EXCESS_NOISE**2 else Quality(0)
+        text = f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}"
+        yield Doubt(bit, f"{text}: the fit is poor", blocking=False)
     instrument = result.model.instrument(result.values).patched()
     for sentence in extrapolations(instrument, curves_of(result.calset)):
         yield Doubt(Quality(0), sentence, blocking=False)
@@ -377,16 +342,13 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None
         pull = (value - p.prior[0]) / p.prior[1]
-        yield Doubt(
-            Quality.AT_PRIOR_EDGE,
-            f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}",
-        )
+        text = f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+        yield Doubt(Quality.AT_PRIOR_EDGE, text)
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:
         reason = result.errors_from.removeprefix("residuals: ").replace("chi2/dof", "χ²/dof")
-        reason = reason.replace(" states", " states of the exposures").replace(
-            " cells", " cells of the field"
-        )
+        for short, text in ((" states", " states of the exposures"), (" cells", " cells of the field")):
+            reason = reason.replace(short, text)
         text = f"errors of parameters are estimated from the scatter of the residuals ({reason})"
         yield Doubt(Quality(0), text, blocking=False)
 

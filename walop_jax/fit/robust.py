@@ -16,7 +16,6 @@ Limits      data that scatter as they should, in blocks that know nothing of eac
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,16 +35,10 @@ FEWEST_BLOCKS = 8
 CELLS = 6  # of the field along a side
 
 
-class RobustErrors(NamedTuple):
-    """Covariance of the free parameters, and its origin in words."""
+def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) -> tuple[Matrix, str]:
+    """Covariance of the free parameters from the residuals at a minimum, and its origin in words.
 
-    covariance: Matrix
-    made_from: str
-
-
-def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) -> RobustErrors:
-    """Errors from the residuals at a minimum; `expansion` is the expansion there, `values` a full vector.
-
+    `expansion` is the expansion there, `values` a full vector.
     Of whole frames the blocks are those of the field points that stand for all pixels; of another large set those of
     a sample of its points, as if the others had residuals like them.
     """
@@ -55,7 +48,7 @@ def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) 
     prior = np.zeros((len(values), len(values)))
     prior[rows.index, rows.index] = rows.width**-2
     prior = model.selection().T @ prior @ model.selection()
-    square = max(expansion.data / max(expansion.dof, 1), 1.0)
+    square = max(expansion.misfit, 1.0)
     bread = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), hermitian=True, rcond=1e-15)
     independent = (expansion.matrix - prior) * square / scale**2 + prior
     covariance = bread @ (independent * np.outer(unit, unit)) @ bread
@@ -72,7 +65,7 @@ def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) 
         ways.append(f"{count} {name}")
     # A FITS card has room for 68 characters.
     made_from = f"residuals: chi2/dof = {square:.4g}" + "".join(f", {way}" for way in ways)
-    return RobustErrors(covariance * np.outer(unit, unit), made_from)
+    return covariance * np.outer(unit, unit), made_from
 
 
 def larger(one: Matrix, other: Matrix) -> Matrix:

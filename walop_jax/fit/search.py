@@ -55,12 +55,8 @@ class FoundMinimum:
 
     @property
     def misfit(self) -> float:
-        """χ² of the data with their errors as given, per degree of freedom."""
-        return _misfit(self.expansion)
-
-
-def _misfit(expansion: Expansion) -> float:
-    return expansion.data / max(expansion.dof, 1)
+        """`Expansion.misfit` at the minimum."""
+        return self.expansion.misfit
 
 
 def free_scales(model: Model) -> Vector:
@@ -95,14 +91,14 @@ def _search(
         return near
 
     def tell(step: int, best: Expansion) -> None:
-        likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {_misfit(best):.6g}")
+        likelihood.runner.tell(f"{label}: step {step} of at most {maximum_steps}, χ²/dof {best.misfit:.6g}")
 
     minimum = minimise(
         evaluate,
         first[model.free],
         free_scales(model),
         maximum_steps=maximum_steps,
-        far_off=lambda found: not _misfit(found) < FAR_OFF,
+        far_off=lambda expansion: not expansion.misfit < FAR_OFF,
         progress=tell,
         **how,
     )
@@ -114,9 +110,8 @@ def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
 
     They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
     """
-    return _search(
-        likelihood, "closer to the data", values, 1.0, maximum_steps=FIRST_STEPS, tolerance=distance
-    ).values
+    how = {"maximum_steps": FIRST_STEPS, "tolerance": distance}
+    return _search(likelihood, "closer to the data", values, 1.0, **how).values
 
 
 def find_minimum(
@@ -242,25 +237,16 @@ def check_identifiable(likelihood: Likelihood) -> None:
     through = (e.clp_in | (not polariser)) & (likelihood.census.rows > 0)
     angles = np.unique(np.round(np.mod(e.clp_angle[through & e.clp_in], 180.0), 3))
     turning = [e.position(prefix).angle for prefix in likelihood.plan.moving]
-    states = len(
-        np.unique(np.nan_to_num(np.stack([np.zeros(len(e)), *turning], axis=1)[through], nan=-1.0), axis=0)
-    )
+    states = np.stack([np.zeros(len(e)), *turning], axis=1)[through]
+    states = len(np.unique(np.nan_to_num(states, nan=-1.0), axis=0))
     if len(angles) < 3 and ((polariser and len(angles) == 0) or states < 3):
-        raise fail(
-            f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data",
-            file=inputs,
-            extension="EXPOSURES",
-            column="CLP_ANGLE",
-            advice="a fit of the instrument needs at least 3, better 8 or more spread over 360°",
-        )
+        what = f"{len(angles)} distinct polariser angle(s) modulo 180° with usable data"
+        advice = "a fit of the instrument needs at least 3, better 8 or more spread over 360°"
+        raise fail(what, file=inputs, extension="EXPOSURES", column="CLP_ANGLE", advice=advice)
     if likelihood.layout.points < 2 and likelihood.model.template.throughput.degree > 0:
-        raise fail(
-            "a single field point",
-            file=inputs,
-            extension="POINTS",
-            advice="the throughput over the field needs several; write degree = 0 under [throughput] of the instrument "
-            "file, or give more points",
-        )
+        advice = "the throughput over the field needs several; write degree = 0 under [throughput] of the"
+        advice += " instrument file, or give more points"
+        raise fail("a single field point", file=inputs, extension="POINTS", advice=advice)
 
 
 def _order_starts(likelihood: Likelihood) -> Iterator[tuple[str, Vector]]:

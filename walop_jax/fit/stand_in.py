@@ -34,10 +34,7 @@ def on_field_points(result: FitResult) -> FitResult:
 def in_field_points(
     calset: CalibrationSet, model: Model, tell: Progress, look: Callable[[FitResult], Structure]
 ) -> CalibrationSet:
-    """Whole frames of many pixels as the set that stands for them at their minimum; any other set as it is.
-
-    `look` says by how much single pixels differ beyond the model of a fit.
-    """
+    """Whole frames as the set that stands for them, `look` giving the spread of pixels; any other set as it is."""
     likelihood = Likelihood.of(calset, model, runner=Runner(progress=tell))
     if not (likelihood.layout.large and stands_for_pixels(likelihood, model.start)):
         return calset
@@ -78,13 +75,10 @@ def with_pixels(result: FitResult) -> FitResult:
 
 def values_then(result: FitResult) -> Float[np.ndarray, " n"]:
     """Values at which the pixels of a set were summed; parameters that were not there then have their start values."""
-    compression = result.calset.compression
+    compression, model = result.calset.compression, result.model
     assert compression is not None
-    model = result.model
-    values = [
-        compression.values.get(name, value) for name, value in zip(model.names, model.start, strict=True)
-    ]
-    return np.array(values)[model.masters]
+    starts = zip(model.names, model.start, strict=True)
+    return np.array([compression.values.get(name, start) for name, start in starts])[model.masters]
 
 
 def moved(result: FitResult) -> float:

@@ -94,8 +94,6 @@ class Structure:
 
 
 NO_STRUCTURE = Structure()
-
-
 NOT_MEASURED = (
     "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
@@ -143,10 +141,8 @@ class Hidden:
         for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
             if not measured:
                 together.setdefault(remedy, []).append(name)
-        return tuple(
-            f"{', '.join(names)} (to measure it: {remedy})" if remedy else ", ".join(names)
-            for remedy, names in together.items()
-        )
+        joined = {", ".join(names): remedy for remedy, names in together.items()}
+        return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
@@ -199,9 +195,7 @@ class Verdict:
     @property
     def doubts(self) -> tuple[str, ...]:
         """The sentences about the residuals alone (`Quality.DOUBTED`)."""
-        return tuple(
-            doubt.sentence for doubt in self.against if doubt.bit & Quality.DOUBTED and doubt.sentence
-        )
+        return tuple(d.sentence for d in self.against if d.bit & Quality.DOUBTED and d.sentence)
 
     @property
     def words(self) -> str:

@@ -15,16 +15,7 @@ import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from walop_jax.io.atomic import (
-    check_output,
-    errors_of,
-    flush,
-    flush_folder,
-    own_prefix,
-    prefix_of,
-    remove,
-    remove_leftovers,
-)
+from walop_jax.io import atomic
 from walop_jax.io.errors import DataError, fail
 
 
@@ -38,7 +29,7 @@ def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, ove
     folder = Path(path)
     try:
         if not folder.exists():
-            return check_output(folder)
+            return atomic.check_output(folder)
         if not folder.is_dir():
             raise fail("is a file, a folder is needed", file=path, advice="choose another name")
         existing = [name for name in names if (folder / name).exists()]
@@ -83,30 +74,30 @@ class OutputFolder:
         names = tuple(names) or self.names
         check_folder(self.path, names, overwrite=self.overwrite)
         new, untouched = not self.target.is_dir(), True
-        temporary = (self.target.parent if new else self.target) / f"{own_prefix(self.target)}new"
+        temporary = (self.target.parent if new else self.target) / f"{atomic.own_prefix(self.target)}new"
         try:
             temporary.mkdir()
-            with errors_of(self.path, temporary):
+            with atomic.errors_of(self.path, temporary):
                 yield temporary
             missing = [name for name in names if not (temporary / name).is_file()]
             names = tuple(name for name in names if name not in missing)
             for name in names:
-                flush(temporary / name, self.target / name)
-            flush_folder(temporary)
+                atomic.flush(temporary / name, self.target / name)
+            atomic.flush_folder(temporary)
             if new:
                 os.rename(temporary, self.target)
             else:
                 untouched = False
                 for name in (*names[1:], *missing, *drop):
-                    remove(self.target / name)
+                    atomic.remove(self.target / name)
                 for name in names:
                     os.replace(temporary / name, self.target / name)
-            flush_folder(self.target.parent if new else self.target)
+            atomic.flush_folder(self.target.parent if new else self.target)
         except OSError as error:
             advice = "free some space; the old content is untouched" if untouched else "write it again"
             raise fail(f"writing failed: {error.strerror or error}", file=self.path, advice=advice) from error
         finally:
-            remove(temporary)
+            atomic.remove(temporary)
         if missing:
             raise NotWrittenError(
                 f"{self.path}: {', '.join(missing)} was not written, all else was; report this"
@@ -123,9 +114,9 @@ def output_folder(
     """
     target = check_folder(path, names, overwrite=overwrite)
     apart = os.access(target.parent, os.W_OK | os.X_OK)
-    with locked((target.parent if apart else target) / f"{prefix_of(target)}lock", path):
+    with locked((target.parent if apart else target) / f"{atomic.prefix_of(target)}lock", path):
         for place in (target, target / target.name):
-            remove_leftovers(place)
+            atomic.remove_leftovers(place)
         check_folder(path, names, overwrite=overwrite)  # another process may have written meanwhile
         yield OutputFolder(Path(path), target, tuple(names), overwrite)
 

@@ -6,26 +6,13 @@ PRODUCT, MODEL = "calibration.fits", "model.toml"
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
 POSTERIOR, CORNER, SAMPLE = "posterior.nc", "posterior_corner.png", "sample.json"
-COMPARISON, EPOCH, LIMITS, COMMISSIONING = (
-    "comparison.json",
-    "epoch.json",
-    "limits.json",
-    "commissioning.json",
-)
+COMPARISON, EPOCH = "comparison.json", "epoch.json"
+LIMITS, COMMISSIONING = "limits.json", "commissioning.json"
 PLANNED, WATCHED, SURVEY, AFFECTED = "plan.json", "watch.json", "survey.json", "affected.json"
 NIGHTS, REFERENCE, TRACKS = "nights.fits", "reference.fits", "tracks.fits"
 
-DOCUMENTS = {
-    "summary": SUMMARY,
-    "diagnosis": DIAGNOSIS,
-    "sample": SAMPLE,
-    "comparison": COMPARISON,
-    "epoch": EPOCH,
-    "limits": LIMITS,
-    "commissioning": COMMISSIONING,
-    "plan": PLANNED,
-    "survey": SURVEY,
-    "watch": WATCHED,
-    "affected": AFFECTED,
-}
+_JSON = (
+    SUMMARY, DIAGNOSIS, SAMPLE, COMPARISON, EPOCH, LIMITS, COMMISSIONING, PLANNED, SURVEY, WATCHED, AFFECTED,
+)  # fmt: skip
+DOCUMENTS = {file.removesuffix(".json"): file for file in _JSON}
 """Files of the documents of commands, by the name of the document."""

@@ -25,7 +25,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.engine import PointData, best_flux, point_prediction, real_counts, sharing
+from walop_jax.likelihood.engine import (
+    PointData,
+    best_flux,
+    counts_and_slope,
+    point_prediction,
+    real_counts,
+    sharing,
+)
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.layout import PointReader, median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
@@ -64,10 +71,7 @@ def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -
 def own_columns(
     likelihood: Likelihood, values: Vector, effects: Sequence[Effect]
 ) -> Float[np.ndarray, "d a"]:
-    """The same for effects of a user's own, amplitude by amplitude: the light path with each of them, differentiated.
-
-    Effects that differ in nothing but numbers share a program.
-    """
+    """The same for effects of a user's own, by differentiation; those that differ in numbers alone share a program."""
     columns, plans = [], {}
     for effect in effects:
         structure = jax.tree.structure(effect)
@@ -96,10 +100,8 @@ def _own_at_point(
     flat, to_tree = ravel_pytree(neutral)
     size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
     change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
-    _, along = jax.jvp(lambda f: real_counts(at_neutral, plan, unit, f), (flux,), (jnp.ones_like(flux),))
-    projected = project_flux(
-        change, along * point.weight, plan.exposures.flux_known, sharing(instrument, plan, point)
-    )
+    along = counts_and_slope(at_neutral, plan, unit, flux)[1] * point.weight
+    projected = project_flux(change, along, plan.exposures.flux_known, sharing(instrument, plan, point))
     return -projected.reshape(len(change), -1).T
 
 
@@ -136,41 +138,22 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     lights = jax.vmap(slots.light_slopes, (None, Sight(None, 0, None, 0, 0)))(
         instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
     )
-    counts = jax.vmap(lambda v, taken: jnp.einsum("eks,eks->ek", v[point.band], taken))(
-        vectors.vectors, lights.taken
-    )
+    counts = jnp.einsum("meks,meks->mek", vectors.vectors[:, point.band], lights.taken)
     if sites == 1:
-        opposite = light.counts(
-            instrument,
-            light.band_rows(instrument, plan, x[1], y[1]),
-            instrument.throughput.at(x[1], y[1]),
-            sights._replace(sky=point.opposite_sky, x=x[1], y=y[1]),
-            point.band,
-        )
+        rows, throughput = light.band_rows(instrument, plan, x[1], y[1]), instrument.throughput.at(x[1], y[1])
+        sight = sights._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+        opposite = light.counts(instrument, rows, throughput, sight, point.band)
     else:
         opposite = counts[1]
     unit = light.with_ghosts(instrument, counts[0], opposite, point.source)
     direct = jnp.ones_like(unit)
     ghost_share = light.with_ghosts(instrument, jnp.zeros_like(unit), direct, point.source)
     flux = best_flux(instrument, plan, unit, point)
-    reported, along = jax.jvp(
-        lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
-    )
+    reported, along = counts_and_slope(instrument, plan, unit, flux)
     share, ghost = jnp.stack([direct, ghost_share])[:sites], Ghost(jnp.ones(unit.shape[1]))
     opposite = ghost.seen(point.source < 0, opposite)
     added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
     return _AtPoint(vectors, lights, share, counts, opposite, flux, flux * unit, added, along)
-
-
-def _fringes(
-    instrument: Instrument,
-    plan: Plan,
-    gaps: Float[Array, " g"],
-    x: Float[Array, "p m"],
-    y: Float[Array, "p m"],
-) -> Float[Array, "p m w g b k 4"]:
-    at = jax.vmap(slots.fringe_slopes, (None, None, None, 0, 0))
-    return jax.vmap(at, (None, None, None, 0, 0))(instrument, plan, gaps, x, y)
 
 
 def _visibilities(instrument: Instrument, plan: Plan, gaps: Float[Array, " g"]) -> Float[Array, " g"]:
@@ -182,10 +165,7 @@ def _visibilities(instrument: Instrument, plan: Plan, gaps: Float[Array, " g"]) 
 
 
 def _pushed(
-    instrument: Instrument,
-    plan: Plan,
-    counts: Float[Array, "p e k"],
-    change: Float[Array, "a p e k"],
+    instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"], change: Float[Array, "a p e k"]
 ) -> Float[Array, "a p e k"]:
     """Change of the counts that the detectors report, for counts that change."""
 
@@ -200,7 +180,12 @@ def _at_each(instrument: Instrument, plan: Plan, points: PointData) -> _AtPoint:
 
 
 _at_points = compiled(_at_each, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="responses")
-_fringes_at = compiled(_fringes, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="fringes")
+_at_sites = jax.vmap(slots.fringe_slopes, (None, None, None, 0, 0))
+_fringes_at = compiled(
+    jax.vmap(_at_sites, (None, None, None, 0, 0)),
+    optimised_above=limits.SELDOM_OPTIMISED_ABOVE,
+    kept_as="fringes",
+)
 _visible = compiled(_visibilities, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
@@ -340,9 +325,8 @@ class ResponseBlock:
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
         self.of = of
         data, self.found = of.responses(start)
-        self.x, self.y, weight, self.band, source = (
-            np.asarray(getattr(data, name)) for name in ("x", "y", "weight", "band", "source")
-        )
+        arrays = (data.x, data.y, data.weight, data.band, data.source)
+        self.x, self.y, weight, self.band, source = map(np.asarray, arrays)
         self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
@@ -399,11 +383,8 @@ class ResponseBlock:
             return {}
         sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
         padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
-        slopes = [
-            np.asarray(_fringes_at(self.of.instrument, self.of.fringe_plan, batch, *sites))
-            for batch in np.split(padded, len(padded) // GAPS_TOGETHER)
-        ]
-        joined = np.concatenate(slopes, axis=3)
+        at, batches = (self.of.instrument, self.of.fringe_plan), padded.reshape(-1, GAPS_TOGETHER)
+        joined = np.concatenate([_fringes_at(*at, batch, *sites) for batch in batches], axis=3)
         return {
             ("fringes", place, gap): joined[:, :, plate, i]
             for i, gap in enumerate(distinct)
@@ -444,12 +425,8 @@ class ResponseBlock:
             return self._pairs(responses.counts * cameras) * self.share * self.flux
         if stage == "opposite":
             return self._alone(responses.opposite * cameras) * self.flux
-        added = (
-            np.broadcast_to(self.of.median, responses.electrons.shape)
-            if stage == "median"
-            else responses.added[stage]
-        )
-        return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
+        added = responses.added | {"median": np.broadcast_to(self.of.median, responses.electrons.shape)}
+        return self._alone(added[stage] * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
         """Values that enter once, for any number of sites."""
@@ -484,25 +461,18 @@ class ResponseBlock:
 
     def _write(self, change: Float[np.ndarray, "a k n"], columns: Float[np.ndarray, "a d"]) -> None:
         """Project the flux out and write rows in the order of the residuals."""
-        along = self._pairs(self.found.along) * self.weight
-        flux_known = self.of.likelihood.flux_known
-        shape = (*self.used.shape, self.cameras)
+        along, flux_known = self._pairs(self.found.along) * self.weight, self.of.likelihood.flux_known
         if not self.shared.single:
 
             def cube(pairs: Float[np.ndarray, "... k n"]) -> np.ndarray:
-                return np.moveaxis(pairs, -2, -1).reshape(*pairs.shape[:-2], *shape)
+                return np.moveaxis(pairs, -2, -1).reshape(*pairs.shape[:-2], *self.used.shape, self.cameras)
 
             projected = project_flux(cube(change), cube(along), flux_known, self.shared)
             columns[:] = -projected[:, self.used].reshape(len(columns), -1)
             return
         free = np.where(np.broadcast_to(~flux_known, self.used.shape).reshape(-1)[self.chosen], 1.0, 0.0)
-        together = self.shared.cameras
-        groups = (
-            [np.arange(self.cameras)]
-            if together is None
-            else [np.flatnonzero(g) for g in np.unique(together, axis=0)]
-        )
-        for group in groups:
+        together = np.ones((1, self.cameras)) if self.shared.cameras is None else self.shared.cameras
+        for group in map(np.flatnonzero, np.unique(together, axis=0)):
             slopes = along[group]
             power = np.sum(slopes**2, axis=0)
             unit = slopes * (free / np.sqrt(np.where(power > 0, power, 1.0)))

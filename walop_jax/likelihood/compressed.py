@@ -54,10 +54,7 @@ def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "
 
 
 def compressed(expansion: PixelExpansion) -> CalibrationSet:
-    """The calibration set of field points that stands for all pixels, near the values of an expansion.
-
-    The rows of a table beside the frames are in it as they are.
-    """
+    """The set of points that stands for all pixels near the values of an expansion, and the rows of a table beside."""
     sums = expansion.sums
     cells, likelihood = sums.cells, sums.likelihood
     (s, over), (t, up) = (_shares(edges) for edges in cells.edges())
@@ -93,13 +90,8 @@ def compressed(expansion: PixelExpansion) -> CalibrationSet:
         values=dict(zip(names, sums.values.tolist(), strict=True)),
         frames=calset.inputs,
     )
-    return dataclasses.replace(
-        calset,
-        points=points,
-        intensities=TableIntensities.dense(points, block),
-        compression=record,
-        remarks=(),
-    )
+    table = TableIntensities.dense(points, block)
+    return dataclasses.replace(calset, points=points, intensities=table, compression=record, remarks=())
 
 
 def _with_gradient(

@@ -138,9 +138,7 @@ def best_flux(
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
-            counts, slope = jax.jvp(
-                lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),)
-            )
+            counts, slope = counts_and_slope(instrument, plan, unit, flux)
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, flux_known, shared)
             flux = jnp.where(flux_known[:, None], flux, flux + step)
@@ -152,6 +150,13 @@ def real_counts(
 ) -> Float[Array, "e k"]:
     """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit)
+
+
+def counts_and_slope(
+    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
+) -> tuple[Float[Array, "e k"], Float[Array, "e k"]]:
+    """The same, and their derivative with respect to the flux."""
+    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),))
 
 
 def point_residuals(
@@ -186,10 +191,7 @@ def _linear_unit_counts(
 def _star_responses(
     instrument: Instrument, plan: Plan, fields: Float[Array, "f s"], data: PointData
 ) -> Float[Array, "p e k c"]:
-    """Share by which the counts of a star change for 1 rms of q in each field, then of u.
-
-    `fields` are rms of the values of standards, field by field.
-    """
+    """Share by which counts of a star change for 1 rms (`fields`, field by field) of q, then of u."""
     standard = instrument.standard
 
     def counts(off: Float[Array, "2 f"], point: PointData) -> Float[Array, "e k"]:
@@ -243,14 +245,6 @@ def _point_jacobian(
     return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
-def _point_normal(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
-) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
-    """χ², Jᵀr and JᵀJ of one point in its local quantities."""
-    r, jacobian = _point_jacobian(instrument, plan, point, nodes)
-    return r @ r, jacobian @ r, jacobian @ jacobian.T
-
-
 def normal_equations(
     instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
 ) -> Normal:
@@ -262,11 +256,9 @@ def normal_equations(
         return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
-        points = data
-        if len(data.x) > limits.BATCH:
-            points = jax.tree.map(
-                lambda leaf, first=start: np.asarray(leaf)[first : first + limits.BATCH], data
-            )
+        rows = slice(start, start + limits.BATCH)
+        few = len(data.x) <= limits.BATCH
+        points = data if few else jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], data)
         residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
@@ -274,10 +266,7 @@ def normal_equations(
 
 
 def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
-    """Sums over blocks of points, so that intermediate results stay in the processor's cache.
-
-    Points that make no whole number of blocks, and few points, are one block.
-    """
+    """Sums over blocks of points, whose intermediate results stay in the processor's cache; few are one block."""
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
         return _block_equations(instrument, plan, data, nodes)
@@ -289,16 +278,22 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     """Sums of the results of a function for the slices along the first axis, one after the other."""
     first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
     nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
-    return jax.lax.scan(
-        lambda total, part: (jax.tree.map(jnp.add, total, function(part)), None), nothing, parts
-    )[0]
+
+    def add(total: Any, part: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, function(part)), None
+
+    return jax.lax.scan(add, nothing, parts)[0]
 
 
 def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
-    chi2, gradient, gram = jax.vmap(_point_normal, in_axes=(None, None, 0, None))(
-        instrument, plan, data, nodes
-    )
+
+    def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
+        """χ², Jᵀr and JᵀJ in its local quantities."""
+        r, jacobian = _point_jacobian(instrument, plan, point, nodes)
+        return r @ r, jacobian @ r, jacobian @ jacobian.T
+
+    chi2, gradient, gram = jax.vmap(of_point)(data)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     g = jnp.zeros(size).at[plain].set(gradient[:, :k].sum(axis=0))
@@ -330,10 +325,8 @@ def _linearised_residuals(
     residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size
-    slope = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))(
-        local, basis
-    )
-    return residual, slope
+    spread = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))
+    return residual, spread(local, basis)
 
 
 def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:

@@ -16,6 +16,7 @@ Tolerance   A relative error ε of all n counts, each known to σ/N, moves a par
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self
@@ -121,11 +122,9 @@ def accurate_table(
     for count in counts:
         x, y = chebyshev.grid(rectangle, count)
         if truth is None:
-            solutions = exact(np.append(x, other_x), np.append(y, other_y))
-            values, truth = (
-                jax.tree.map(lambda leaf, cut=cut: leaf[cut], solutions)
-                for cut in (slice(0, len(x)), slice(len(x), None))
-            )
+            solutions, points = exact(np.append(x, other_x), np.append(y, other_y)), len(x)
+            values = jax.tree.map(lambda leaf, end=points: leaf[:end], solutions)
+            truth = jax.tree.map(lambda leaf, end=points: leaf[end:], solutions)
         else:
             values = exact(x, y)
         table = FieldTable.through(rectangle, count, values, total=total)
@@ -185,11 +184,7 @@ def accurate_nodes(
         tilt = np.abs(interpolated[1] - truth[1]) * scale[:, None, None, None]
         return float(max(off, tilt.max(initial=0.0)))
 
-    table, off = accurate_table(
-        lambda x, y: solved_optics(instrument, plan, x, y),
-        rectangle,
-        [count for count in limits.NODES_PER_SIDE if count >= (first or 0)],
-        TOLERANCE,
-        error,
-    )
+    exact, counts = functools.partial(solved_optics, instrument, plan), limits.NODES_PER_SIDE
+    counts = [count for count in counts if count >= (first or 0)]
+    table, off = accurate_table(exact, rectangle, counts, TOLERANCE, error)
     return jax.tree.map(array, table), off

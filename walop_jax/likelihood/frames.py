@@ -212,11 +212,11 @@ class Cells:
         """Edges of the columns and rows of cells, or of blocks of `together` × `together` of them, within the frame."""
         rows, columns = self.shape
         counts = ((columns, self.grid.width), (rows, self.grid.height))
-        edges = [
+        s, t = (
             np.minimum(np.append(np.arange(0, n, together), n) * self.side, pixels) / pixels * 2.0 - 1.0
             for n, pixels in counts
-        ]
-        return edges[0], edges[1]
+        )
+        return s, t
 
     def middles(self, together: int = 1) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " r"]]:
         """Middles of the columns and rows of cells, or of blocks of them."""
@@ -341,10 +341,7 @@ def strips_of(likelihood: Likelihood) -> int:
 
 
 def stands_for_pixels(likelihood: Likelihood, values: Vector) -> bool:
-    """True if cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames.
-
-    There may be a table beside the frames.
-    """
+    """True if cells can stand for the pixels of a set: counts linear in a flux of their own, smooth over the frames."""
     instrument, selection = likelihood.model.instrument(values), frames_among(likelihood.calset)
     if selection is None or not light.is_linear(instrument) or likelihood.plan.exposures.shared is not None:
         return False
@@ -385,9 +382,8 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         strip = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), fixed, together)
         if int(strip.impossible):
             frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
-        return np.asarray(strip.moments), jax.tree.map(
-            lambda leaf: np.asarray(leaf)[..., :columns], strip.cells
-        )
+        cut = jax.tree.map(lambda leaf: np.asarray(leaf)[..., :columns], strip.cells)
+        return np.asarray(strip.moments), cut
 
     step = height * cells.grid.width * every
     moments, strip_cells = np.zeros(series.shape), []
@@ -422,15 +418,8 @@ def _series(
         return _at(_solve, likelihood, instrument, *cells.field(s, t))
 
     def error(interpolated: Smooth, truth: Smooth) -> float:
-        off = [
-            float(np.abs(value - true_value).max())
-            for value, true_value in (
-                (interpolated.unit[..., exposures], truth.unit[..., exposures]),
-                (interpolated.vectors, truth.vectors),
-                (interpolated.stokes[:, exposures], truth.stokes[:, exposures]),
-            )
-        ]
-        return max(off) if np.all(np.isfinite(off)) else float("nan")
+        chosen = ((s.unit[..., exposures], s.vectors, s.stokes[:, exposures]) for s in (interpolated, truth))
+        return float(np.max([np.abs(a - b).max() for a, b in zip(*chosen, strict=True)]))
 
     return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
 
@@ -464,12 +453,7 @@ class PixelExpansion(Expansion):
 def expand_pixels(
     likelihood: Likelihood, values: Vector, noise_scale: float = 1.0, every: int = 1
 ) -> PixelExpansion:
-    """As `Likelihood.expand`, by one pass over all pixels of frames, or over one strip in `every`.
-
-    A table beside the frames is expanded row by row.
-
-    Raises what `frame_sums` raises.
-    """
+    """As `Likelihood.expand`, by a pass over all pixels or one strip in `every`; a table beside them by its rows."""
     values = np.asarray(values, float)
     sums = frame_sums(likelihood, values, every)
     terms = DataTerms(sums.chi2, half_gradient(sums), gauss_newton(sums), sums.census)

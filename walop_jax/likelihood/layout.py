@@ -106,11 +106,8 @@ class Layout:
         point_bytes = bytes_per_point(exposures, calset.cameras, mirrored=mirrored, fields=fields)
         in_memory = 2 * point_bytes * points <= allowed
         # Whole batches; and many of them, as pixels are read in whole rows of the frames.
-        slab_bytes = min(
-            limits.LARGEST_SLAB,
-            int(allowed) // (limits.READING * threads),
-            point_bytes * points // limits.SLABS,
-        )
+        share = int(allowed) // (limits.READING * threads)
+        slab_bytes = min(limits.LARGEST_SLAB, share, point_bytes * points // limits.SLABS)
         slab = batch * max(1, slab_bytes // (point_bytes * batch))
         return cls(
             plan=plan,
@@ -151,16 +148,12 @@ def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
 
 def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
     """The curves of the filters in use."""
-    return [
-        calset.filters[name] for name in np.unique(calset.exposures.filter).tolist() if name in calset.filters
-    ]
+    names = np.unique(calset.exposures.filter).tolist()
+    return [calset.filters[name] for name in names if name in calset.filters]
 
 
 def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False, fields: int = 0) -> int:
-    """Size of the point data of one field point: per exposure counts and weights, sky, source and band.
-
-    For each field of stars that scatter as much as counts and weights once more.
-    """
+    """Bytes of one field point: counts, weights, sky, source, band; the first two again for each field of stars."""
     return 8 * (2 + exposures * (2 * (1 + fields) * cameras + (4 if mirrored else 2) + 1 + 1))
 
 
@@ -228,9 +221,8 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     starts = np.append(starts[starts + length <= min(of_table, default=n)], of_table)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
-    return dataclasses.replace(
-        calset, points=points, intensities=RunsOfPoints(calset.intensities, starts, length)
-    )
+    runs = RunsOfPoints(calset.intensities, starts, length)
+    return dataclasses.replace(calset, points=points, intensities=runs)
 
 
 def _spread(points: int, sample: int, length: int) -> Int[np.ndarray, " s"]:
@@ -295,7 +287,6 @@ class PointReader:
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
         sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
-        opposite = self.sky_polarisation(-block.x, -block.y) if self.mirrored else None
         data = PointData(
             x=array(block.x),
             y=array(block.y),
@@ -304,7 +295,7 @@ class PointReader:
             sky=array(self.sky_polarisation(block.x, block.y)),
             source=array(block.source),
             band=array(band),
-            opposite_sky=None if opposite is None else array(opposite),
+            opposite_sky=array(self.sky_polarisation(-block.x, -block.y)) if self.mirrored else None,
         )
         fields = fields_of_stars(self.calset.sources)
         return data._replace(stars=array(self._stars(data, fields))) if len(fields) else data
@@ -323,8 +314,6 @@ class PointReader:
         """Rows of the exposures of the Moon sky, and the positions of the Moon then."""
         e: Exposures = self.calset.exposures
         rows = np.flatnonzero(e.direct("moon"))
-        if not rows.size:
-            return rows, np.zeros(0), np.zeros(0)
         return rows, *_moon_at(tuple(e.mjd[rows].tolist()), self.calset.site)
 
     def sky_polarisation(self, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
@@ -333,8 +322,8 @@ class PointReader:
         sky = np.zeros((len(x), len(e), 2))
         rows, ra, dec = self._moon
         if rows.size:
-            q, u = rayleigh_sky(ra, dec, e.ra[rows], e.dec[rows], e.rotator[rows], x, y)
-            sky[:, rows, 0], sky[:, rows, 1] = q, u
+            pair = rayleigh_sky(ra, dec, e.ra[rows], e.dec[rows], e.rotator[rows], x, y)
+            sky[:, rows] = np.stack(pair, axis=-1)
         return sky
 
 
@@ -379,4 +368,4 @@ class MeasuredPoints:
 @functools.lru_cache(maxsize=32)
 def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
     """Direction of the Moon, kept: the same set is brought together with many models."""
-    return body_direction("moon", np.array(mjd), site)
+    return body_direction("moon", np.array(mjd), site) if mjd else (np.zeros(0), np.zeros(0))

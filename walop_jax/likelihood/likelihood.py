@@ -64,12 +64,8 @@ class DataTerms(NamedTuple):
 
     def joined(self, other: DataTerms) -> DataTerms:
         """The terms of two parts of a set."""
-        return DataTerms(
-            self.data + other.data,
-            self.gradient + other.gradient,
-            self.matrix + other.matrix,
-            self.census.joined(other.census),
-        )
+        a, b, census = self, other, self.census.joined(other.census)
+        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census)
 
 
 Joined = TypeVar("Joined", Census, DataTerms)
@@ -107,6 +103,11 @@ class Expansion:
     def chi2(self) -> float:
         """Sum over data and priors."""
         return self.data + self.priors
+
+    @property
+    def misfit(self) -> float:
+        """χ² of the data with their errors as given, per degree of freedom."""
+        return self.data / max(self.dof, 1)
 
     @property
     def objective(self) -> float:
@@ -154,10 +155,9 @@ def prior_rows(model: Model) -> PriorRows:
             rows.append((i, *p.prior, True))
         elif p.loose is not None:
             rows.append((i, p.start, p.loose, False))
-    index, mean, width, measured = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return PriorRows(
-        np.array(index, int), np.array(mean, float), np.array(width, float), np.array(measured, bool)
-    )
+    index, mean, width, known = zip(*rows, strict=True) if rows else ((),) * 4
+    at, is_known = np.array(index, int), np.array(known, bool)
+    return PriorRows(at, np.array(mean, float), np.array(width, float), is_known)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -203,14 +203,9 @@ class Likelihood:
         instrument = self.model.instrument(values)
         if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
             return self
-        return Likelihood.of(
-            self.calset,
-            dataclasses.replace(self.model, template=instrument),
-            memory=self.layout.allowed,
-            runner=self.runner,
-            interpolate=self.layout.interpolated,
-            sets=self.layout.sets,
-        )
+        model, layout = dataclasses.replace(self.model, template=instrument), self.layout
+        how = {"memory": layout.allowed, "interpolate": layout.interpolated, "sets": layout.sets}
+        return Likelihood.of(self.calset, model, runner=self.runner, **how)
 
     @property
     def calset(self) -> CalibrationSet:
@@ -349,9 +344,8 @@ class Likelihood:
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
         """True where the intensities of a (point, exposure) are used."""
-        return np.concatenate([np.asarray(batch.weight)[..., 0] > 0 for batch in self.points])[
-            : self.layout.points
-        ]
+        used = [np.asarray(batch.weight)[..., 0] > 0 for batch in self.points]
+        return np.concatenate(used)[: self.layout.points]
 
     # ----------------------------------------------------------------------------------------- row by row
 
@@ -363,9 +357,7 @@ class Likelihood:
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
-        flux, residual = (
-            np.concatenate([np.asarray(batch_result[i]) for batch_result in batches]) for i in (0, 1)
-        )
+        flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
@@ -374,16 +366,13 @@ class Likelihood:
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
         instrument, select = self.model.instrument(values), self.model.selection()
-        matrices = [
-            used_rows(engine.linearised_residuals(instrument, self.plan, c)[1], c) @ select
-            for c in self.points
-        ]
-        return np.concatenate(matrices)
+        slopes = ((engine.linearised_residuals(instrument, self.plan, c)[1], c) for c in self.points)
+        return np.concatenate([used_rows(slope, batch) @ select for slope, batch in slopes])
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors that enter the instrument, per unit flux."""
         instrument = self.model.instrument(values)
-        vectors = [np.asarray(engine.incoming(instrument, self.plan, batch)) for batch in self.points]
+        vectors = [engine.incoming(instrument, self.plan, batch) for batch in self.points]
         return np.concatenate(vectors)[: self.layout.points]
 
 

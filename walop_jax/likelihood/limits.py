@@ -34,8 +34,8 @@ COLUMNS = 256
 RESPONSES_TOGETHER = 32
 """Field points whose responses are computed together: one program serves sets of any size."""
 RESPONSES_AT_ONCE = 4
-"""How many of these are worked on at a time: their derivatives stay in the processor's cache, in two fifths of the
-time."""
+"""Those of them that are worked on at a time: their derivatives stay in the processor's cache, and take two fifths of
+the time."""
 RESPONSES_KEPT = 1024
 """Largest number of field points whose responses are kept for further columns: 200 MB."""
 RESPONSE_NUMBERS = 4_000_000

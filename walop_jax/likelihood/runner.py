@@ -44,20 +44,15 @@ class Runner:
             self.progress(text)
 
     def each(self, label: str, work: Callable[[int], T], points: int, slab: int) -> Iterator[T]:
-        """The results of `work` for all slabs of `slab` points, in their order; `label` names the pass in progress.
-
-        Raises what `work` raises.
-        """
+        """The results of `work` for all slabs of `slab` points, in order; `label` names the pass in progress."""
         began = last = time.perf_counter()
         with contextlib.closing(self._each(-(-points // slab), work)) as results:
             for count, result in enumerate(results, start=1):
                 time_now = time.perf_counter()
                 if time_now - last > TOLD_EVERY:
                     last, ready, rate = time_now, min(count * slab, points), count * slab / (time_now - began)
-                    self.tell(
-                        f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, "
-                        f"{(points - ready) / rate:.0f} s left of this pass"
-                    )
+                    seconds = f"{(points - ready) / rate:.0f} s left of this pass"
+                    self.tell(f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, {seconds}")
                 yield result
 
     def _each(self, slabs: int, work: Callable[[int], T]) -> Generator[T, None, None]:

@@ -8,6 +8,7 @@ effect on the light (of plates that commute) are listed too: the data decide.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -18,7 +19,7 @@ from walop_jax.model import materials
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.geometry import Wedge
 from walop_jax.model.elements.simple import Analyser, Polariser
-from walop_jax.model.elements.wave_plate import WavePlate
+from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names
 
@@ -31,17 +32,8 @@ JOINED = "; "
 
 def alternatives(instrument: Instrument) -> dict[str, Rearrangement]:
     """All changes of a description that an instrument has places for, by their sentences."""
-    return dict(
-        itertools.chain(
-            _layers(instrument),
-            _turned_plates(instrument),
-            _turned_wedges(instrument),
-            _beams(instrument),
-            _order(instrument),
-            _in_or_out(instrument),
-            _dispersion(instrument),
-        )
-    )
+    families = (_layers, _turned_plates, _turned_wedges, _beams, _order, _in_or_out, _dispersion)
+    return dict(itertools.chain(*(family(instrument) for family in families)))
 
 
 def other_curves(instrument: Instrument) -> tuple[str, ...]:
@@ -68,13 +60,8 @@ def _each_and_all(
     for place in places:
         yield f"{place} {what}", lambda instrument, place=place: change(instrument, place)
     if len(places) > 1:
-
-        def everywhere(instrument: Instrument) -> Instrument:
-            for place in places:
-                instrument = change(instrument, place)
-            return instrument
-
-        yield f"{', '.join(places[:-1])} and {places[-1]} {what}", everywhere
+        everywhere = f"{', '.join(places[:-1])} and {places[-1]} {what}"
+        yield everywhere, lambda instrument: functools.reduce(change, places, instrument)
 
 
 def _used(instrument: Instrument, kind: type[Element]) -> dict[str, Any]:
@@ -191,15 +178,10 @@ def _dispersion(instrument: Instrument) -> Iterator[Named]:
                 continue
             source = curves.get(material) or materials.CRYSTALS[material].source.split(",")[0]
 
-            def changed_curve(
-                instrument: Instrument, material: str = material, family: tuple[str, ...] = family
-            ) -> Instrument:
-                for place in plates:
-                    layers = tuple(
-                        dataclasses.replace(layer, material=material) if layer.material in family else layer
-                        for layer in _used(instrument, WavePlate)[place].layers
-                    )
-                    instrument = instrument.changed(place, layers=layers)
-                return instrument
+            def layers(old: tuple[Layer, ...], to: str = material, of: tuple[str, ...] = family) -> Any:
+                return tuple(dataclasses.replace(v, material=to) if v.material in of else v for v in old)
+
+            def changed_curve(instrument: Instrument, layers: Callable[[Any], Any] = layers) -> Instrument:
+                return functools.reduce(lambda i, place: i.changed(place, layers=layers), plates, instrument)
 
             yield f"{crystal} with the dispersion of {source}", changed_curve

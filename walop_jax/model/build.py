@@ -306,9 +306,7 @@ class _Maker:
         if isinstance(value, Mapping):
             raise self.read.fault(place, f"{key} cannot be a parameter")
         if isinstance(default, bool):
-            if not isinstance(value, bool):
-                raise self.read.fault(place, f"{key} = {value!r} must be true or false")
-            return value
+            return self.read.flag(value, key, place)
         if isinstance(default, int | float):
             return type(default)(self.read.number(value, key, place))
         if isinstance(default, str):

@@ -49,10 +49,8 @@ def needs(instrument: Instrument) -> Needs:
     """Requirements of the light path of an instrument, effects included, from a run on shapes alone."""
 
     def run(quantities: Set[str], instrument: Instrument) -> tuple[Instrument, Array]:
-        patched, plan = (
-            instrument.patched(),
-            blank_plan(instrument, quantities - {"median"}, "median" in quantities),
-        )
+        patched = instrument.patched()
+        plan = blank_plan(instrument, quantities - {"median"}, "median" in quantities)
         x, y = map(jnp.asarray, AT)
         rows = light.band_rows(patched, plan, x, y)
         zeros = jnp.zeros_like(plan.exposures.kind)

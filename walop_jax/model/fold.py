@@ -22,14 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from walop_jax.model.elements.base import Element
+from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.light_path import Arm
 from walop_jax.model.mueller import product
 from walop_jax.model.ray import Ray
 
 Station = tuple[Element, Ray]
-Mueller = Float[Array, "... 4 4"]
 WHOLE = 64  # angles of a whole turn
 FEWEST, PER_RADIAN = 8, 12.0  # angles of a partial turn: the minimum, and more for each radian
 

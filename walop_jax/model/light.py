@@ -33,6 +33,10 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
 
+Rows = Float[Array, "b r 4"]  # band, row of an analyser, Stokes
+Vectors = Float[Array, "b k 4"]  # band, camera, Stokes
+Counts = Float[Array, "e k"]  # exposure, camera
+Shares = Float[Array, " k"]  # camera
 FEW_BANDS = 3
 FEW_SETTINGS = 4  # up to this number band integrals are computed one by one
 BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `LightPath.filter_shift`
@@ -109,7 +113,7 @@ def mean_wavelengths(instrument: LightPath, plan: Plan) -> Float[Array, " b"]:
     return weights_at(plan, wavelength, plan.teff) @ wavelength
 
 
-def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b r 4"]:
+def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Rows:
     """Band-integrated Mueller rows (band, row, Stokes): all of the optics at a field point.
 
     Rows are those of the analysers, arm by arm: S0, then the analysed component; where the beams of an analyser differ
@@ -142,9 +146,7 @@ def integrated(
     return jnp.concatenate(sums, axis=-3)
 
 
-def in_bands(
-    instrument: LightPath, bands: Float[Array, "b r 4"], mean: Float[Array, " b"]
-) -> Float[Array, "b r 4"]:
+def in_bands(instrument: LightPath, bands: Rows, mean: Float[Array, " b"]) -> Rows:
     """Band-integrated rows with balance and loss of the analysers, at mean wavelengths (µm)."""
     analysers = [arm.analyser for arm in instrument.arms]
     if all(analyser.balance is None and analyser.loss is None for analyser in analysers):
@@ -177,16 +179,14 @@ def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n
     return path.backward(path.solved(), len(plan.wavelength))
 
 
-def camera_vectors(
-    instrument: LightPath, rows: Float[Array, "b r 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
-) -> Float[Array, "b k 4"]:
+def camera_vectors(instrument: LightPath, rows: Rows, throughput: Shares, x: Scalar, y: Scalar) -> Vectors:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
     beam_vectors = beams(instrument, rows) @ upstream(instrument, x, y)
     return behind_throughput(instrument, beam_vectors, throughput, x, y)
 
 
-def beams(instrument: LightPath, rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+def beams(instrument: LightPath, rows: Rows) -> Vectors:
     """Rows of the cameras: shares of each beam in the rows of its analyser."""
     index, shares = _beams(instrument)
     contributions = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
@@ -194,8 +194,8 @@ def beams(instrument: LightPath, rows: Float[Array, "b r 4"]) -> Float[Array, "b
 
 
 def behind_throughput(
-    instrument: LightPath, beams: Float[Array, "b k 4"], throughput: Float[Array, " k"], x: Scalar, y: Scalar
-) -> Float[Array, "b k 4"]:
+    instrument: LightPath, beams: Vectors, throughput: Shares, x: Scalar, y: Scalar
+) -> Vectors:
     """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and mixing."""
     for component in instrument.cameras.transmission:
         throughput = throughput * component.factors(x, y)
@@ -287,12 +287,8 @@ def _turned(instrument: LightPath, sight: Sight) -> Sight:
 
 
 def counts(
-    instrument: LightPath,
-    rows: Float[Array, "b r 4"],
-    throughput: Float[Array, " k"],
-    sight: Sight,
-    band: Int[Array, " e"],
-) -> Float[Array, "e k"]:
+    instrument: LightPath, rows: Rows, throughput: Shares, sight: Sight, band: Int[Array, " e"]
+) -> Counts:
     """Counts of the cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     instrument = instrument.patched()
     exposures, x, y = sight.exposures, sight.x, sight.y
@@ -317,12 +313,7 @@ def has_ghosts(instrument: LightPath) -> bool:
     return bool(instrument.patched().cameras.ghosts)
 
 
-def with_ghosts(
-    instrument: LightPath,
-    counts: Float[Array, "e k"],
-    opposite: Float[Array, "e k"],
-    source: Int[Array, " e"],
-) -> Float[Array, "e k"]:
+def with_ghosts(instrument: LightPath, counts: Counts, opposite: Counts, source: Int[Array, " e"]) -> Counts:
     """Counts for light of unit flux with ghosts of those at the opposite field point, `opposite`."""
     for ghost in instrument.patched().cameras.ghosts:
         counts = counts + ghost.seen(source < 0, opposite)
@@ -334,9 +325,7 @@ def is_linear(instrument: LightPath) -> bool:
     return not instrument.patched().cameras.detectors
 
 
-def detected(
-    instrument: LightPath, exposures: ExposureArrays, counts: Float[Array, "e k"]
-) -> Float[Array, "e k"]:
+def detected(instrument: LightPath, exposures: ExposureArrays, counts: Counts) -> Counts:
     """Counts reported by the detectors for counts in electrons: the only stage non-linear in the light."""
     for detector in instrument.patched().cameras.detectors:
         counts = detector.reported(counts, exposures)

@@ -15,18 +15,16 @@ from typing import Any, Self, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from walop_jax.io.errors import nearest
 from walop_jax.model.cameras import Cameras, Throughput
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import WavePlate
-from walop_jax.model.parameters import Component, by_shapes, check_names, number, unknown_name
+from walop_jax.model.parameters import Component, Scalar, by_shapes, check_names, number, unknown_name
 from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import Source, Standards
 
-Scalar = Float[Array, ""]
 AnyPart = TypeVar("AnyPart", bound=Component)
 
 
@@ -69,8 +67,8 @@ class LightPath(Component):
     cameras: Cameras
     path: tuple[str, ...] = eqx.field(static=True)
     effects: tuple[Any, ...] = ()  # patches: `effects.base.Effect`
-    rotator_zero: Scalar | None = number(unit="deg", about="true ROTATOR minus the header's", default=None)
-    filter_shift: Scalar | None = number(unit="um", about="displacement of broad bands", default=None)
+    rotator_zero: Scalar | None = number("deg", "true ROTATOR minus the header's", default=None)
+    filter_shift: Scalar | None = number("um", "displacement of broad bands", default=None)
     sky_films: tuple[
         Any, ...
     ] = ()  # changes of light from the sky in single exposures (`effects.optics.Film`)
@@ -150,10 +148,7 @@ class LightPath(Component):
 
     def effect(self, name: str) -> Any:
         """The active effect of a name; ValueError when there is none."""
-        for effect in self.effects:
-            if effect.name == name:
-                return effect
-        raise unknown_name("active effect", name, [effect.name for effect in self.effects])
+        return _member(self.effects, name, "active effect")
 
     # ------------------------------------------------------------------------------- changing it
 
@@ -202,11 +197,11 @@ class LightPath(Component):
         return dataclasses.replace(self, sources=tuple(sources.values()))
 
 
-def _member(members: tuple[AnyPart, ...], name: str, what: str) -> AnyPart:
-    for member in members:
-        if _name(member) == name:
-            return member
-    raise NoSuchPlaceError(str(unknown_name(what, name, [_name(member) for member in members])))
+def _member(members: tuple[Any, ...], name: str, what: str) -> Any:
+    by_name = {member.name: member for member in members}
+    if name not in by_name:
+        raise NoSuchPlaceError(str(unknown_name(what, name, by_name)))
+    return by_name[name]
 
 
 @by_shapes
@@ -224,10 +219,6 @@ def is_achromatic(element: Element) -> bool:
     return True
 
 
-def _name(member: Any) -> str:
-    return member.name
-
-
 def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str) -> AnyPart:
     if not path:
         names = [field.name for field in dataclasses.fields(part)]
@@ -241,9 +232,9 @@ def _changed(part: AnyPart, path: list[str], fields: dict[str, Any], place: str)
         members = getattr(part, field.name)
         if field.metadata.get("static", False) or not isinstance(members, tuple):
             continue
-        names += [_name(member) for member in members if isinstance(member, Element | Arm)]
+        names += [member.name for member in members if isinstance(member, Element | Arm)]
         for i, member in enumerate(members):
-            if isinstance(member, Component) and _name(member) == path[0]:
+            if isinstance(member, Component) and member.name == path[0]:  # pyright: ignore
                 new = (*members[:i], _changed(member, path[1:], fields, place), *members[i + 1 :])
                 return dataclasses.replace(part, **{field.name: new})
     raise NoSuchPlaceError(f"the instrument has no part {place!r}; {nearest(path[0], names)}")

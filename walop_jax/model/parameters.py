@@ -29,6 +29,7 @@ NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
 
 Vector = Float[Array, " n"]
+Scalar = Float[Array, ""]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
 """Valid names of parameters, in models and in files."""
 
@@ -101,10 +102,10 @@ def _finite(value: Any) -> bool:
 
 
 def param(
-    *,
     unit: str,
     about: str,
     source: str,
+    *,
     width: float | None = None,
     scale: float | None = None,
     loose: float | None = None,
@@ -120,13 +121,19 @@ def param(
     return eqx.field(metadata={PARAMETER: declared}, converter=as_number, **extra)
 
 
-def number(*, unit: str, about: str, default: float | None = 0.0, several: bool = False) -> Any:
-    """Declare a number of an Equinox module, optionally a parameter in a description; `several`: a row of them.
+def number(unit: str, about: str, *, default: float | None = 0.0) -> Any:
+    """Declare a number of an Equinox module, optionally a parameter in a description.
 
     Values become float64 arrays; None stays, for an absent number.
     """
-    declared = Parameter("", unit, about, "")
-    return eqx.field(metadata={NUMBER: declared, SEVERAL: several}, converter=as_number, default=default)
+    metadata = {NUMBER: Parameter("", unit, about, ""), SEVERAL: False}
+    return eqx.field(metadata=metadata, converter=as_number, default=default)
+
+
+def row(unit: str, about: str) -> Any:
+    """Declare a row of numbers, absent unless given, otherwise as `number`."""
+    metadata = {NUMBER: Parameter("", unit, about, ""), SEVERAL: True}
+    return eqx.field(metadata=metadata, converter=as_number, default=None)
 
 
 def as_number(value: Any) -> Any:

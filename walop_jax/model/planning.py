@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Collection, Iterable, Mapping
 
 import jax
@@ -241,7 +242,7 @@ def _plan(
     slope: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[Plan, Int[np.ndarray, " n"]]:
     """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
-    requirements, patched = needs(instrument), instrument.patched()
+    requirements, patched, count = needs(instrument), instrument.patched(), len(settings)
     moving = patched.moving()
     names = sorted(requirements.conditions)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
@@ -250,18 +251,16 @@ def _plan(
     # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so that a set with another
     # colour for one of them has a plan of the same shape, and the same programs.
     # The angles of all elements, then their turns during the exposure.
-    still = np.zeros(len(settings))
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
-    turns = [settings.turns.get(prefix, still) for prefix in moving]
-    states = _rows([*places, *turns], len(settings))
-    planned = _rows([values[name] for name in names], len(settings))
+    turns = [settings.turns.get(prefix, np.zeros(count)) for prefix in moving]
+    states = _rows([*places, *turns], count)
+    planned = _rows([values[name] for name in names], count)
     teff = np.nan_to_num(settings.teff).tolist()
-    sloping = np.zeros(len(settings), bool) if slope is None else slope
-    labels = [""] * len(settings) if kinds is None else kinds.tolist()
+    sloping = np.zeros(count, bool) if slope is None else slope
+    labels = [""] * count if kinds is None else kinds.tolist()
     columns = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
     keys = list(zip(*columns, strict=True))
     bands = sorted(set(keys))
-    index = {key: i for i, key in enumerate(bands)}
 
     groups = sorted({(name, moment) for _, name, moment, *_ in bands})
     curves = {name: filters[name] for name, _ in groups}
@@ -279,32 +278,26 @@ def _plan(
     width = {
         n: float(np.trapezoid(c.throughput, c.wavelength) / c.throughput.max()) for n, c in curves.items()
     }
-    offset, start = {}, 0
-    for group in groups:
-        offset[group] = start
-        start += len(rules[group[0]][0])
-    weight = np.zeros((len(bands), start))
-    for i, (_, name, moment, *_) in enumerate(bands):
-        first = offset[name, moment]
-        weight[i, first : first + len(rules[name][1])] = rules[name][1]
+    nodes, weights = (np.concatenate([rules[name][i] for name, _ in groups]) for i in (0, 1))
+    group = np.repeat(np.arange(len(groups)), [len(rules[name][0]) for name, _ in groups])
+    of_band = np.array([groups.index((name, moment)) for _, name, moment, *_ in bands])
 
     def per_node(of_group: list[float]) -> Float[Array, " n"]:
-        counts = [len(rules[name][0]) for name, _ in groups]
-        return array(np.repeat(np.asarray(of_group, float), counts))
+        return array(np.asarray(of_group, float)[group])
 
-    laid = []
-    ordered = [key[0] for key in bands]
-    for value in sorted(set(ordered)):
+    laid, last = [], 0
+    for value, members in itertools.groupby(bands, key=lambda key: key[0]):
+        first, last = last, last + len(list(members))
         pairs = zip(value[: len(moving)], value[len(moving) :], strict=True)
         state = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
-        laid.append((state, ordered.index(value), len(ordered) - ordered[::-1].index(value)))
+        laid.append((state, first, last))
     plan = Plan(
-        wavelength=array(np.concatenate([rules[name][0] for name, _ in groups])),
+        wavelength=array(nodes),
         conditions=Conditions(
             band_width=per_node([width[name] for name, _ in groups]),
             planned={name: per_node([moment[i] for _, moment in groups]) for i, name in enumerate(names)},
         ),
-        node_weight=array(weight),
+        node_weight=array(np.where(of_band[:, None] == group, weights, 0.0)),
         teff=array([key[3] for key in bands], float),
         exposures=exposures,
         band_of=np.zeros((0, 1), int),
@@ -312,6 +305,7 @@ def _plan(
         moving=moving,
         slope=array([key[4] for key in bands], float) if sloping.any() else None,
     )
+    index = {key: i for i, key in enumerate(bands)}
     return plan, np.array([index[key] for key in keys], int)
 
 

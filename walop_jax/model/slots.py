@@ -48,6 +48,8 @@ from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
 
 Slot = tuple[Any, ...]
 Moved = Callable[[Float[Array, " t"]], Instrument]
+Place = tuple[Scalar, Scalar]  # in the field (deg)
+Gaps = Float[Array, " g"]  # thicknesses of air (µm)
 OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 
@@ -56,10 +58,8 @@ OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
 def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
     """The elements behind the polariser and those of the arms of an instrument (`patched`), by beginnings of names."""
-    return {
-        "": instrument.behind_polariser(),
-        **{f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms},
-    }
+    in_arms = {f"{arm.name}.": tuple(arm.train()) for arm in instrument.arms}
+    return {"": instrument.behind_polariser()} | in_arms
 
 
 @by_shapes
@@ -135,14 +135,14 @@ def vector_slots(instrument: Instrument) -> dict[Slot, int]:
 class VectorSlopes(NamedTuple):
     """Analysis vectors of light behind the polariser at a field point, and their slopes in `vector_slots`."""
 
-    vectors: Float[Array, "b k 4"]
+    vectors: light.Vectors
     slopes: Float[Array, "s b k 4"]
 
 
 class _Banded(NamedTuple):
     """Band sums of the rows of the analysers, and slopes: of generators at places, of plates, all together."""
 
-    rows: Float[Array, "b r 4"]
+    rows: light.Rows
     inserted: Float[Array, "m g h b r 4"]
     plates: Float[Array, "w g t b r 4"]
     whole: Float[Array, "u b r 4"]
@@ -177,7 +177,7 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
 
 
 def fringe_slopes(
-    instrument: Instrument, plan: Plan, gaps: Float[Array, " g"], x: Scalar, y: Scalar
+    instrument: Instrument, plan: Plan, gaps: Gaps, x: Scalar, y: Scalar
 ) -> Float[Array, "w g b k 4"]:
     """Slopes in the contrast of fringes of air ahead of every plate of `fringe_places`, by its thickness (µm)."""
     instrument = instrument.patched()
@@ -189,7 +189,7 @@ def fringe_slopes(
             changed = with_air_gap(changed, place, sizes[0], jnp.zeros(()))
         return changed
 
-    def vectors(rows: Float[Array, "b r 4"]) -> Float[Array, "b k 4"]:
+    def vectors(rows: light.Rows) -> light.Vectors:
         return _vectors(instrument, (x, y), rows, *_neutral(instrument, plan, x, y))
 
     banded = _banded(plan, (x, y), moved, (1, 0), gaps)
@@ -203,13 +203,8 @@ def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[
 
 
 def _vectors(
-    instrument: Instrument,
-    at: tuple[Scalar, Scalar],
-    rows: Array,
-    mean: Array,
-    throughput: Array,
-    shares: Array,
-) -> Float[Array, "b k 4"]:
+    instrument: Instrument, at: Place, rows: Array, mean: Array, throughput: Array, shares: Array
+) -> light.Vectors:
     """Analysis vectors with shares of every camera in every other."""
     beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
     pairs = tuple(np.ndindex(len(throughput), len(throughput)))
@@ -217,9 +212,7 @@ def _vectors(
     return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
 
 
-def _banded(
-    plan: Plan, at: tuple[Scalar, Scalar], moved: Moved, sizes: tuple[int, int], gaps: Float[Array, " g"]
-) -> _Banded:
+def _banded(plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:
     """Band sums at a field point, and slopes in the sizes of `moved`: of single plates, then of all together.
 
     Those of plates are multiplied by fringes of air of some thicknesses (µm).
@@ -230,12 +223,7 @@ def _banded(
 
 
 def _summed(
-    plan: Plan,
-    at: tuple[Scalar, Scalar],
-    moved: Moved,
-    sizes: tuple[int, int],
-    gaps: Float[Array, " g"],
-    stretch: Scalar,
+    plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps, stretch: Scalar
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
     conditions = plan.conditions
@@ -266,11 +254,8 @@ def _summed(
 
     def pushed(number: int, selection: slice) -> Float[Array, "t c n r 4"]:
         """Rows for some changes of the matrix of a station."""
-        tangents = {
-            key: tangent[selection]
-            for key, tangent in slopes.items()
-            if key[0] == number and tangent is not None
-        }
+        of_station = {k: slope for k, slope in slopes.items() if k[0] == number and slope is not None}
+        tangents = {key: slope[selection] for key, slope in of_station.items()}
         if not tangents:
             return jnp.zeros((len(nothing[selection]), *rows.shape))
         behind, ahead = sides[number]

@@ -26,10 +26,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.kinds import KINDS, ExposureKind
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
-from walop_jax.model.parameters import Component, number, param
+from walop_jax.model.parameters import Component, Scalar, number, param
 from walop_jax.model.ray import NotPlannedError
 
-Scalar = Float[Array, ""]
 PAPER_II = "Maharana et al. 2022, Paper II"
 COLOUR_OF_STANDARDS = "Serkowski, Mathewson & Ford 1975, ApJ 196, 261; Whittet et al. 1992, ApJ 386, 562"
 WHITTET = "Whittet et al. 1992, ApJ 386, 562: 0.55 µm, most stars within 0.1 µm"
@@ -140,13 +139,9 @@ class MoonSky(Source):
     """Singly scattered moonlight, depolarised."""
 
     depolarisation: Scalar = param(
-        unit="",
-        about="δ, one for all patches and wavelengths",
-        source=f"{PAPER_II}, eq. 8",
-        scale=0.05,
-        default=0.8,
+        "", "δ, one for all patches and wavelengths", f"{PAPER_II}, eq. 8", scale=0.05, default=0.8
     )
-    missing: Scalar | None = number(unit="", about="degree taken away by multiple scattering", default=None)
+    missing: Scalar | None = number("", "degree taken away by multiple scattering", default=None)
     patches: MoonPatches | None = None
 
     name: ClassVar[str] = "sky"
@@ -180,24 +175,21 @@ class Standards(Source):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    q: Float[Array, " s"] = param(unit="", about="catalogue q", source="SOURCES table", scale=2e-4)
-    u: Float[Array, " s"] = param(unit="", about="catalogue u", source="SOURCES table", scale=2e-4)
+    q: Float[Array, " s"] = param("", "catalogue q", "SOURCES table", scale=2e-4)
+    u: Float[Array, " s"] = param("", "catalogue u", "SOURCES table", scale=2e-4)
     lmax: Float[Array, " c"] = param(
-        unit="um", about="wavelength of largest polarisation", source=WHITTET, width=0.1, default=()
+        "um", "wavelength of largest polarisation", WHITTET, width=0.1, default=()
     )
     turn: Float[Array, " c"] = param(
-        unit="deg/um", about="slope of the angle with wavelength", source=TURN_SOURCE, width=3.0, default=()
+        "deg/um", "slope of the angle with wavelength", TURN_SOURCE, width=3.0, default=()
     )
     wavelength: Float[Array, " n"] = param(
-        unit="um",
-        about="wavelength at which the catalogue value holds",
-        source="FILTER of EXPOSURES",
-        default=(),
+        "um", "wavelength at which the catalogue value holds", "FILTER of EXPOSURES", default=()
     )
     bands: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
-    angle: Scalar | None = number(unit="deg", about="added to all position angles", default=None)
+    angle: Scalar | None = number("deg", "added to all position angles", default=None)
     changes: tuple[Any, ...] = ()  # `effects.numbers.GrownStandard`
 
     name: ClassVar[str] = "standard"

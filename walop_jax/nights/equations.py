@@ -48,10 +48,7 @@ MOST_SHAPES = (
 )
 OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make
 SIDEREAL = 1.00273791  # sidereal hours in an hour
-CLOCK = (
-    0.2,
-    0.05,
-)  # hours by which hour angles disagree with MJD, and their scatter: signs of another clock
+CLOCK = 0.2, 0.05  # hours by which hour angles disagree with MJD, and their scatter: signs of another clock
 
 Vector = Float[np.ndarray, " _"]
 
@@ -482,15 +479,8 @@ def together(nights: Sequence[Night]) -> Together:
         np.unique(keys, return_inverse=True)[1].astype(int)
         for keys in ([night.number for night in ordered], [night.sha256 for night in ordered])
     )
-    equations = Equations(
-        np.array([night.mjd for night in ordered]),
-        number,
-        file,
-        chi2,
-        gradient,
-        matrix,
-        scale,
-    )
+    mjd = np.array([night.mjd for night in ordered])
+    equations = Equations(mjd, number, file, chi2, gradient, matrix, scale)
     return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
 
 

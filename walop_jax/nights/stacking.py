@@ -297,11 +297,8 @@ def _linearised(
     for begin in (0, *(2**k for k in range(len(order).bit_length()))):
         if not (batch := order[begin : max(1, 2 * begin)]):
             break
-        points = [dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch]
-        tasks = [
-            Task(at_hand[nights[u].key], nights[u], at, candidates)
-            for u, at in zip(batch, points, strict=True)
-        ]
+        at = {u: dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch}
+        tasks = [Task(at_hand[nights[u].key], nights[u], at[u], candidates) for u in batch]
         *earlier, (last,) = makers.make(tasks)
         for u, (night,) in zip(batch, earlier, strict=False):
             nights[u] = night

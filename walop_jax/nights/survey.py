@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import measures_u, p_errors
+from walop_jax.calibration.accuracy import GOAL, measures_u, p_errors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail

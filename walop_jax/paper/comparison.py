@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import LARGEST_P, STARS, sample_stars
+from walop_jax.calibration.accuracy import GOAL, LARGEST_P, SMALLEST_DETERMINANT, STARS, sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL, SMALLEST_DETERMINANT
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import DEFAULT_FILTER, Settings
@@ -93,10 +92,7 @@ class Offsets:
             "with_one_unpolarised_exposure": size(self.anchored),
             "explained_by_weakest_direction": explained(self.along),
             "explained_by_three_weakest_directions": explained(self.along_three),
-            "condition_number": {
-                "median": float(np.median(self.condition)),
-                "max": float(self.condition.max()),
-            },
+            "condition_number": _summary(self.condition),
         }
 
 
@@ -109,21 +105,16 @@ def offsets(
 ) -> Offsets:
     """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
     centre = measured_qu(reference[..., 0])  # (q_m, u_m) of unpolarised light
-    small = transmitted(reference, np.concatenate([np.zeros((1, 2)), stars]))
-    exact, _ = fit_polynomials(
-        np.concatenate([measured_qu(transmitted(reference, states)), measured_qu(small)], axis=1),
-        np.concatenate([states, np.zeros((1, 2)), stars]),
-    )
+    light = np.concatenate([states, np.zeros((1, 2)), stars])
+    exact, _ = fit_polynomials(measured_qu(transmitted(reference, light)), light)
     design = polynomial_terms(measured)
     scale = np.linalg.norm(design, axis=1)
     directions = np.linalg.svd(design / scale[:, None], full_matrices=False)[2]
     departure = (paper.coefficients - exact) * scale[:, None]
 
     def along(count: int) -> Float[np.ndarray, "p 2"]:
-        weak = directions[:, -count:]
-        return np.einsum(
-            "pct,pnt,pnv,pv->pc", departure, weak, weak, polynomial_terms(centre) / scale, optimize=True
-        )
+        weak, terms = directions[:, -count:], polynomial_terms(centre) / scale
+        return np.einsum("pct,pnt,pnv,pv->pc", departure, weak, weak, terms, optimize=True)
 
     smooth, _ = fit_polynomials(measured_qu(transmitted(reference, states)), states)
     anchored, _ = fit_polynomials(
@@ -133,12 +124,8 @@ def offsets(
     def delta(coefficients: Float[np.ndarray, "p 2 5"]) -> Float[np.ndarray, "p 2"]:
         return with_test_stars(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
 
-    return Offsets(
-        delta(paper.coefficients), along(1), along(3), delta(smooth), delta(anchored), paper.condition
-    )
-
-
-# ------------------------------------------------------------------------------------- both methods, one set
+    found, noiseless, with_one = (delta(values) for values in (paper.coefficients, smooth, anchored))
+    return Offsets(found, along(1), along(3), noiseless, with_one, paper.condition)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -205,10 +192,7 @@ class Comparison(Drawn):
                 "where",
                 "of",
                 "method",
-                ">median (%)",
-                ">rms (%)",
-                ">95 % (%)",
-                ">max (%)",
+                *(f">{s} (%)" for s in ("median", "rms", "95 %", "max")),
                 ">below 0.1 %",
             ),
             rows=tuple(rows),
@@ -216,22 +200,21 @@ class Comparison(Drawn):
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
         """One row per point, the grid first: position, errors of both methods, the values of the paper."""
-        places = (self.grid, self.between)
         count = len(self.between.x)
-        on_grid = np.arange(len(self.grid.x) + count) < len(self.grid.x)
+
+        def both(name: str) -> np.ndarray:
+            return np.concatenate([getattr(errors, name) for errors in (self.grid, self.between)])
+
         columns = {
-            "X": (np.concatenate([p.x for p in places]), "[deg] field position"),
-            "Y": (np.concatenate([p.y for p in places]), "[deg] field position"),
-            "GRID": (on_grid, "a point with a polynomial of its own"),
-            "ZONE": (
-                np.concatenate([p.zone for p in places]),
-                "one exposure carries almost no information on u",
-            ),
+            "X": (both("x"), "[deg] field position"),
+            "Y": (both("y"), "[deg] field position"),
+            "GRID": (np.arange(len(both("x"))) < len(self.grid.x), "a point with a polynomial of its own"),
+            "ZONE": (both("zone"), "one exposure carries almost no information on u"),
         }
         for k, quantity in enumerate(QUANTITIES):
             for method in ("paper", "joint"):
-                errors = np.concatenate([getattr(p, method)[:, k] for p in places])
-                columns[f"{quantity}_{method}".upper()] = errors, f"rms error of {quantity}, {method}"
+                about = f"rms error of {quantity}, {method}"
+                columns[f"{quantity}_{method}".upper()] = both(method)[:, k], about
         for name, values in (("DELTA", self.paper.delta), ("SIGMA", self.paper.spread)):
             padded = np.concatenate([values, np.full((count, 2), np.nan)])
             columns[f"{name}_Q"] = padded[:, 0], f"{name.lower()} of q as in Paper II"
@@ -270,19 +253,16 @@ def compare(
     ) -> MethodErrors:
         joint = vectors(x, y)
         reference = joint if true is None else true
-        promised = promised_errors(analysis, setting, x, y, stars)
-        return MethodErrors(
-            x,
-            y,
-            star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars),
-            promised if true is None else joint_errors(joint, reference, stars),
-            np.abs(determinant(reference)) < SMALLEST_DETERMINANT,
-        )
+        of_paper = star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
+        if true is None:
+            of_joint = promised_errors(analysis, setting, x, y, stars)
+        else:
+            of_joint = joint_errors(joint, reference, stars)
+        return MethodErrors(x, y, of_paper, of_joint, np.abs(determinant(reference)) < SMALLEST_DETERMINANT)
 
     if truth is None:
-        rng = np.random.default_rng([seed, 1])
+        rng, true = np.random.default_rng([seed, 1]), None
         x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
-        true = None
     else:
         x, y = truth.x, truth.y
         true = truth_vectors(vectors(x, y), truth.matrix)

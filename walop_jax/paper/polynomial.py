@@ -225,17 +225,12 @@ class Patches:
 
     def document(self, numbers: Int[np.ndarray, " e"]) -> dict[str, Any]:
         """The verdicts as plain data; `numbers` are the EXPOSURE numbers of the set."""
-        columns = {
-            "exposure": numbers[self.exposure],
-            "scale": self.scale,
-            "chi2_per_dof": self.flatness,
-            "departure_percent": 100.0 * self.departure,
-            "weight": self.weight,
-        }
-        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        names = "exposure", "scale", "chi2_per_dof", "departure_percent", "weight"
+        columns = numbers[self.exposure], self.scale, self.flatness, 100.0 * self.departure, self.weight
+        rows = zip(*(values.tolist() for values in columns), strict=True)
         return {
             "depolarisation": self.depolarisation,
-            "patches": [dict(zip(columns, row, strict=True)) for row in rows],
+            "patches": [dict(zip(names, row, strict=True)) for row in rows],
             "doubted": numbers[self.exposure[self.doubted]].tolist(),
         }
 
@@ -257,15 +252,10 @@ def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:
     rows = []
     for k, m in enumerate(moon):
         measured = np.flatnonzero(block.used[:, m])
-        vectors = analysis.coloured(
-            settings[m : m + 1],
-            block.x[measured],
-            block.y[measured],
-            np.full(len(measured), float(e.teff[m])),
-        )
-        estimates = estimate(
-            vectors, block.counts[measured, m], block.sigma[measured, m], np.arange(len(measured))
-        )
+        x, y, teff = block.x[measured], block.y[measured], np.full(len(measured), float(e.teff[m]))
+        vectors = analysis.coloured(settings[m : m + 1], x, y, teff)
+        counts, sigma = block.counts[measured, m], block.sigma[measured, m]
+        estimates = estimate(vectors, counts, sigma, np.arange(len(measured)))
         rows.append(_smooth_fit(estimates.qu, estimates.photon, sky[measured, k]))
     scale, offset, flatness, mean = (np.array(column) for column in zip(*rows, strict=True))
     depolarisation = float(np.median(scale))
@@ -294,12 +284,8 @@ def _smooth_fit(
     pull = np.array([[1.0, 0.0, 0.0]])
     solution = np.linalg.lstsq(np.concatenate([design, pull]), np.append(data, only), rcond=None)[0]
     residual = data - design @ solution
-    return (
-        only,
-        solution[1:] + (solution[0] - only) * sky.mean(axis=0),
-        float(residual @ residual / max(len(residual) - 3, 1)),
-        sky.mean(axis=0),
-    )
+    mean, flatness = sky.mean(axis=0), float(residual @ residual / max(len(residual) - 3, 1))
+    return only, solution[1:] + (solution[0] - only) * mean, flatness, mean
 
 
 # ----------------------------------------------------------------------------------- the scheme of the paper
@@ -307,9 +293,8 @@ def _smooth_fit(
 
 def box_number(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
     """Number of the box of every field point, row by row from the lower left; the outer boxes reach the edge."""
-    column, row = (
-        np.clip(np.floor(v / BOX_WIDTH + 0.5 * BOXES_ALONG), 0, BOXES_ALONG - 1).astype(int) for v in (x, y)
-    )
+    places = np.floor(np.stack([x, y]) / BOX_WIDTH + 0.5 * BOXES_ALONG)
+    column, row = np.clip(places, 0, BOXES_ALONG - 1).astype(int)
     return row * BOXES_ALONG + column
 
 
@@ -335,12 +320,8 @@ def full_moon_scheme(
     centre_x, centre_y = box_centres()
     grid = _positions(block, paper.x, paper.y)
     middle = _positions(block, centre_x, centre_y)
-    if (
-        moon.size == 0
-        or standard.size == 0
-        or np.any(middle < 0)
-        or not block.used[middle][:, standard].any()
-    ):
+    seen = block.used[middle][:, standard]
+    if not moon.size or not seen.any() or np.any(middle < 0):
         raise DataError(
             "POINTS: the full-Moon scheme needs Moon exposures, and standards at the centres of 5 × 5 boxes of 7'"
         )
@@ -348,10 +329,11 @@ def full_moon_scheme(
 
     # Standards: Δ at the centres, where the polynomials are interpolated.
     local = paper.between(centre_x, centre_y).coefficients
-    true = _catalogue(calset, block, standard)
+    star, sources = block.source[middle][:, standard], calset.sources
+    true = np.stack(sky_to_instrument(sources.q[star], sources.u[star], e.rotator[standard]), axis=-1)
     corrected = polynomial(local, measured_qu(block.counts[middle][:, standard]))
-    standard_used = block.used[middle][:, standard]
-    delta_centre = _mean(corrected - true[middle], standard_used[..., None], axis=1)
+    used = seen[..., None]
+    delta_centre = np.sum(np.nan_to_num(corrected - true) * used, axis=1) / np.maximum(used.sum(axis=1), 1)
 
     # Moon: the patch is measured where the polynomials are closest to a centre, and is the same in all the box.
     moon_qu = polynomial(paper.coefficients, measured_qu(block.counts[grid][:, moon]))
@@ -373,18 +355,3 @@ def _positions(block: Block, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " 
     distance = np.hypot(block.x[:, None] - x, block.y[:, None] - y)
     nearest = distance.argmin(axis=0)
     return np.where(distance[nearest, np.arange(len(x))] < 1e-3, nearest, -1)
-
-
-def _catalogue(
-    calset: CalibrationSet, block: Block, standard: Int[np.ndarray, " e"]
-) -> Float[np.ndarray, "p e 2"]:
-    """(q, u) of the standards in the instrument frame: (q + iu) exp(−2i ROTATOR)."""
-    star, sources = block.source[:, standard], calset.sources
-    turned = sky_to_instrument(sources.q[star], sources.u[star], calset.exposures.rotator[standard])
-    return np.stack(turned, axis=-1)
-
-
-def _mean(values: np.ndarray, used: np.ndarray, axis: int) -> np.ndarray:
-    """Mean over the used values, 0 where there are none."""
-    values, used = np.broadcast_arrays(np.nan_to_num(values), used)
-    return np.sum(values * used, axis=axis) / np.maximum(used.sum(axis=axis), 1)

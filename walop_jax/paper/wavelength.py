@@ -86,12 +86,8 @@ def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
 
 def plate_names(instrument: Instrument) -> tuple[str, ...]:
     """Names of the wave plates in the arms, in the order of the arms."""
-    return tuple(
-        f"{arm.name}.{element.name}"
-        for arm in instrument.arms
-        for element in arm.train()
-        if isinstance(element, WavePlate)
-    )
+    named = ((arm.name, element) for arm in instrument.arms for element in arm.train())
+    return tuple(f"{arm}.{element.name}" for arm, element in named if isinstance(element, WavePlate))
 
 
 def _plates(

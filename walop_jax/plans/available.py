@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,12 +91,9 @@ class CandidateExposure(NamedTuple):
 
     def place(self, angle: float, plate: float = 22.5) -> tuple[float, ...]:
         """The phases (rad) of angles (deg) of the polariser, and of the plate where it is free."""
-        if not self.free:
-            return (2 * np.pi * (angle % self.turn) / self.turn,)
-        return (
-            *self._replace(free=False).place(2 * plate - angle),
-            2 * np.pi * (plate % PLATE_TURN) / PLATE_TURN,
-        )
+        direction = 2 * plate - angle if self.free else angle
+        phase = 2 * np.pi * (direction % self.turn) / self.turn
+        return (phase, 2 * np.pi * (plate % PLATE_TURN) / PLATE_TURN) if self.free else (phase,)
 
     def with_plate(self, angle: float) -> CandidateExposure:
         """The same with the plate at an angle (deg)."""
@@ -111,6 +108,11 @@ class CandidateExposure(NamedTuple):
             for p, a in self.positions.items()
         )
         return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
+
+
+def with_stops(plan: ObservingPlan, stops: Iterable[Stop], **changes: Any) -> ObservingPlan:
+    """An observing plan of these exposures alone."""
+    return dataclasses.replace(plan, stops=tuple(stops), patches=(), stars=(), **changes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,16 +185,14 @@ class Available:
         for kind, total in (("moon", plan.moon_patches), ("standard", len(plan.star_names))):
             up[kind], remarks = self._up(kind, total)
             notes += remarks
-        candidates = []
-        positions = {CALIBRATION_PLATE: plan.plate, **plan.moving}
+        candidates, positions = [], {CALIBRATION_PLATE: plan.plate, **plan.moving}
         for name, stops in itertools.product(plan.filter_names, itertools.product(*positions.values())):
             where = dict(zip(positions, stops, strict=True))
             moving = {prefix: a for prefix, a in where.items() if prefix != CALIBRATION_PLATE}
             for kind in EXPOSED:
                 for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
-                    blank = Stop(
-                        0.0 if kind == "clp" else None, name, stops[0], moving, kind=kind, seconds=seconds
-                    )
+                    angle = 0.0 if kind == "clp" else None
+                    blank = Stop(angle, name, stops[0], moving, kind=kind, seconds=seconds)
                     indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
                     members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
                     if members:
@@ -213,14 +213,10 @@ class Available:
             return (), []
         plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
         if not plan.site.known:
-            return (), [
-                f"{what} are left out: the site is not known; give it in the description, under [site]"
-            ]
-        e = dataclasses.replace(
-            plan,
-            stops=tuple(Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)),
-            patches=(),
-            stars=(),
+            advice = "the site is not known; give it in the description, under [site]"
+            return (), [f"{what} are left out: {advice}"]
+        e = with_stops(
+            plan, [Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)]
         ).exposures()
         visible, why = self._visible(e)
         if self.throughout and visible.any():
@@ -229,10 +225,8 @@ class Available:
             high, dark = self._high_and_dark(last)
             visible &= dark & (high | (kind == "standard"))
             why = f"they cannot be observed for all of the {self.throughout:g} minutes"
-        if visible.all():
-            return tuple(range(total)), []
         lost = total - int(visible.sum())
-        notes = [f"{lost} of {total} {what} are left out: {why}{self._better()}"]
+        notes = [f"{lost} of {total} {what} are left out: {why}{self._better()}"] if lost else []
         return tuple(np.flatnonzero(visible).tolist()), notes
 
     def _visible(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], str]:
@@ -253,18 +247,16 @@ class Available:
         if not len(exposures) or not plan.site.known:
             return ()
         visible, why = self._visible(exposures)
-        if visible.all():
-            return ()
         lost = len(exposures) - int(visible.sum())
-        return (f"{lost} of {len(exposures)} exposures of the sky come too late in this order: {why}",)
+        text = f"{lost} of {len(exposures)} exposures of the sky come too late in this order: {why}"
+        return (text,) if lost else ()
 
     def in_whole_seconds(self) -> Available:
         """The same with exposure times of whole seconds, which schedules need."""
-        seconds = {
-            kind: tuple(dict.fromkeys(max(1.0, float(round(t))) for t in times))
-            for kind, times in self.seconds.items()
+        whole = {
+            k: tuple(dict.fromkeys(max(1.0, float(round(t))) for t in ts)) for k, ts in self.seconds.items()
         }
-        return dataclasses.replace(self, seconds=seconds)
+        return dataclasses.replace(self, seconds=whole)
 
     def _better(self) -> str:
         """The next time at which the Moon is full, high and the sky dark."""

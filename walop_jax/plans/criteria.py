@@ -16,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -190,15 +189,12 @@ def criterion_by_name(found: Candidates, field: FieldErrors | None, criterion: s
 
 
 def _of_stars(found: Candidates, table: InputTable) -> Criterion:
-    rules: dict[str, Any] = {
-        name: Column("float", unit) for name, unit in (("X", "deg"), ("Y", "deg"), ("Q", ""), ("U", ""))
-    }
-    x, y, q, u = (numeric_column(table, name, rule) for name, rule in rules.items())
+    units = {"X": "deg", "Y": "deg", "Q": "", "U": ""}
+    x, y, q, u = (numeric_column(table, name, Column("float", unit)) for name, unit in units.items())
     teff = numeric_column(table, "TEFF", Column("float", "K", missing=np.nan))
     if np.any(np.hypot(q, u) == 0):
-        raise ValueError(
-            f"{table.path}: a star with Q = U = 0 has no p; leave it out, or state its expected values"
-        )
+        advice = "leave it out, or state its expected values"
+        raise ValueError(f"{table.path}: a star with Q = U = 0 has no p; {advice}")
     targets_by_colour = []
     for colour in np.unique(teff):
         members = np.flatnonzero((teff == colour) | (np.isnan(teff) & np.isnan(colour)))

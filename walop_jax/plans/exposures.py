@@ -35,7 +35,7 @@ from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
 from walop_jax.model.specification import Model, effect_context, with_effects
-from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure
+from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
 from walop_jax.simulation.simulate import (
@@ -95,9 +95,8 @@ class Candidates:
                 pairs += [(choice.with_plate(a), family.with_plate(a)) for a in angles]
             else:
                 pairs.append((choice, family))
-        return dataclasses.replace(
-            self, choices=tuple(c for c, _ in pairs), families=tuple(f for _, f in pairs)
-        )
+        choices, families = tuple(choice for choice, _ in pairs), tuple(family for _, family in pairs)
+        return dataclasses.replace(self, choices=choices, families=families)
 
 
 def candidates(
@@ -122,12 +121,11 @@ def candidates(
     choices, notes = available.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, stops, turn = fewer_points(available.plan), [], 360.0 if effects else 180.0
+    few, turn = fewer_points(available.plan), 360.0 if effects else 180.0
     choices = tuple(choice._replace(turn=turn) for choice in choices)
-    for choice in choices:
-        stops.append(_nodes(choice, bool(effects)))
+    stops = [_nodes(choice, bool(effects)) for choice in choices]
     first = np.cumsum([0, *map(len, stops)])
-    plan = dataclasses.replace(few, stops=tuple(itertools.chain(*stops)), patches=(), stars=())
+    plan = with_stops(few, itertools.chain(*stops))
     tell("expected counts")
     calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
@@ -143,8 +141,8 @@ def candidates(
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
     responses = []
-    for number, draw in enumerate(values):
-        tell(f"expected counts of instrument {number + 1} of {draws}")
+    for number, draw in enumerate(values, start=1):
+        tell(f"expected counts of instrument {number} of {draws}")
         responses.append(_responses(likelihood, draw))
     families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
@@ -156,9 +154,8 @@ def candidates(
             electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
             star = choice.kind == "standard"
             scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
-            light = Illumination(
-                electrons, noise, floor, shared, 1.0 if star else factor, dict.fromkeys(means, scatter)
-            )
+            scale, of_stars = 1.0 if star else factor, dict.fromkeys(means, scatter)
+            light = Illumination(electrons, noise, floor, shared, scale, of_stars)
             counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
             if polarised:
                 families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
@@ -207,17 +204,16 @@ def _effect_of(name: str, effects: Iterable[str]) -> str:
 
 def fewer_points(plan: ObservingPlan) -> ObservingPlan:
     """The same over fewer field points, which are spread alike."""
-    return dataclasses.replace(
-        plan, grid=min(plan.grid, GRID), standard_grid=min(plan.standard_grid, STAR_GRID)
-        if not any(s.place for s in plan.stops) else plan.standard_grid
-    )  # fmt: skip
+    star_grid = plan.standard_grid if any(s.place for s in plan.stops) else min(plan.standard_grid, STAR_GRID)
+    return dataclasses.replace(plan, grid=min(plan.grid, GRID), standard_grid=star_grid)
 
 
 def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
-    def count(one: ObservingPlan) -> int:
-        return len(one.points()) - (one.standard_grid**2 if one.standards else 0) - one.zero_stars
-
-    return count(plan) / count(few)
+    """Field points of a plan, beside those of stars, over those of another."""
+    many, fewer = (
+        len(p.points()) - (p.standard_grid**2 if p.standards else 0) - p.zero_stars for p in (plan, few)
+    )
+    return many / fewer
 
 
 def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Float[np.ndarray, "r n"]:
@@ -229,8 +225,9 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
         values = np.array([truth[name] for name in model.names])
         if around is not None:
             of = around.model
+            covariance = around.covariance[np.ix_(of.free, of.free)]
             deviation = of.selection() @ rng.multivariate_normal(
-                np.zeros(len(of.free)), around.covariance[np.ix_(of.free, of.free)], method="eigh"
+                np.zeros(len(of.free)), covariance, method="eigh"
             )
             for i, name in enumerate(model.names):
                 if name in of.names:
@@ -258,14 +255,12 @@ def _nodes(choice: CandidateExposure, effects: bool) -> tuple[Stop, ...]:
     if choice.kind != "clp":
         return choice.stops
     count = NODES_OF_EFFECTS if effects else 3 if choice.free else NODES
-    polariser = choice.turn / count * np.arange(count)
-    plate = (
-        PLATE_TURN / NODES_OF_PLATE * np.arange(NODES_OF_PLATE) if choice.free else (choice.stops[0].plate,)
-    )
+    polariser = (choice.turn / count * np.arange(count)).tolist()
+    plates = (PLATE_TURN / NODES_OF_PLATE * np.arange(NODES_OF_PLATE)).tolist()
     return tuple(
-        dataclasses.replace(choice.stops[0], polariser_angle=float(a), plate=None if b is None else float(b))
-        for b in plate
-        for a in polariser
+        dataclasses.replace(choice.stops[0], polariser_angle=angle, plate=plate)
+        for plate in (plates if choice.free else [choice.stops[0].plate])
+        for angle in polariser
     )
 
 
@@ -277,7 +272,7 @@ def _orders(choice: CandidateExposure, angles: int) -> tuple[int, ...]:
 
 def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarray, "s e"]:
     """Weights of equidistant nodes in the series through them."""
-    at_nodes = harmonics(2 * np.pi * np.arange(nodes) / nodes, nodes // 2)
+    at_nodes = harmonics(even_angles((nodes // 2,))[:, 0], nodes // 2)
     return harmonics(angle, nodes // 2) @ np.linalg.inv(at_nodes)
 
 
@@ -374,13 +369,11 @@ class Polarised(Family):
         new = [place for place in places if place.tobytes() not in self.known]
         if new:
             weights = self._weights(np.stack(new))
-            new_matrices = []
+            matrices = []
             for unit, slopes in self.counts:
-                matrices = self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
-                new_matrices += [matrices] if self.by is None else [t.T @ matrices @ t for t in self.by]
-            self.known.update(
-                zip((place.tobytes() for place in new), np.stack(new_matrices, axis=1), strict=True)
-            )
+                of_draw = self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
+                matrices += [of_draw] if self.by is None else [t.T @ of_draw @ t for t in self.by]
+            self.known.update(zip((p.tobytes() for p in new), np.stack(matrices, axis=1), strict=True))
         return np.stack([self.known[place.tobytes()] for place in places], axis=1)
 
     def turned(self, by: Float[np.ndarray, "b f n"]) -> Polarised:
@@ -407,13 +400,11 @@ class Polarised(Family):
             blocks = g.reshape(len(self.counts), len(self.by), *g.shape[1:])
             g = np.einsum("bfn,rbnm,bgm->rfg", self.by, blocks, self.by, optimize=True)
         plates, angles = (count // 2 for count in self._nodes)
-        low = (2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles))[
-            : len(self.orders)
-        ]
+        both = 2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles)
+        low = both[: len(self.orders)]
         weights = self._weights(even_angles(low))
         finer = [
-            _interpolating(2 * np.pi * np.arange(2 * o + 1) / (2 * o + 1), 2 * n + 1)
-            for o, n in zip(self.orders, low, strict=True)
+            _interpolating(even_angles((o,))[:, 0], 2 * n + 1) for o, n in zip(self.orders, low, strict=True)
         ]
         total = np.zeros(np.prod([len(f) for f in finer]))
         for (unit, slopes), matrix in zip(self.counts, g, strict=True):
@@ -452,9 +443,8 @@ class Polarised(Family):
         approximate = first_draw.gains(np.diag(weight)[None])[None]
         for order, angle in zip(self.orders, places.T, strict=True):
             at = _interpolating(angle, 2 * order + 1)
-            approximate = np.einsum(
-                "si,si...->s...", at, np.broadcast_to(approximate, (len(at), *approximate.shape[1:]))
-            )
+            series = np.broadcast_to(approximate, (len(at), *approximate.shape[1:]))
+            approximate = np.einsum("si,si...->s...", at, series)
         # The highest harmonic of the counts beside their mean: none where the series holds them.
         unit = self.counts[0][0]
         series = np.abs(np.fft.fft2(unit.reshape(len(unit), *self._nodes, unit.shape[2]), axes=(1, 2)))
@@ -488,9 +478,8 @@ def information_of(
     known: Calibration, names: Sequence[str], effects: Iterable[str] = ()
 ) -> Float[np.ndarray, "f f"]:
     """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
-    shared = [
-        i for i, name in enumerate(names) if name in known.model.names and not _effect_of(name, effects)
-    ]
+    wanted = [name in known.model.names and not _effect_of(name, effects) for name in names]
+    shared = np.flatnonzero(wanted).tolist()
     columns = [known.model.index(names[i]) for i in shared]
     information = np.zeros((len(names), len(names)))
     information[np.ix_(shared, shared)] = pseudo_inverse(known.covariance[np.ix_(columns, columns)], 1e-12)

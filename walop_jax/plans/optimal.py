@@ -107,9 +107,8 @@ class Experiment:
 
         Directions that nothing informs about (gauges) are left out. Raises NotEstimableError if a target needs one.
         """
-        shares = [
-            self.budget / len(self.families) / family.cost_at(family.spread()) for family in self.families
-        ]
+        each = self.budget / len(self.families)
+        shares = [each / family.cost_at(family.spread()) for family in self.families]
         total = self.known.mean(axis=0) + sum(
             np.tensordot(w / len(w), f.information(f.spread()).mean(axis=0), (0, 0))
             for w, f in zip(shares, self.families, strict=True)
@@ -123,15 +122,13 @@ class Experiment:
         visible = np.einsum("na,rknq->rkaq", to_seen, self.targets)
         # A target is estimable if it has no part in the null space of the total information.
         lost_share = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
-        if np.any(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3))):
-            bad = np.unique(np.argwhere(lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3)))[:, 1])
+        bad = np.flatnonzero((lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3))).any(axis=0))
+        if len(bad):
             raise NotEstimableError(
                 f"targets {', '.join(map(str, bad[:5].tolist()))} depend on parameters that no candidate informs about"
             )
-
         families = tuple(family.turned(to_seen[None]) for family in self.families)
-        # Directions that a few candidates leave open get next to no information: no target needs them, or it is found
-        # bad.
+        # Directions that a few candidates leave open get next to no information: no target needs them, or it is bad.
         prior = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(informed.sum()))
         return Experiment(prior, visible, families, self.budget, self.together)
 
@@ -228,6 +225,14 @@ class _Some:
             by_target = columns.reshape(n, k, q).transpose(1, 0, 2)
             into[:] = matrices.reshape(s, -1) @ (by_target @ by_target.swapaxes(1, 2)).reshape(k, -1).T
         return gains
+
+    def plan(
+        self, weight: Float[np.ndarray, " s"], least: float, bound: float, proof: Bound, rounds: int
+    ) -> Allocation:
+        """The candidates that cost more than `least` with their weights."""
+        used = np.flatnonzero(weight * self.costs > least)
+        family, place = np.array([self.chosen[i][0] for i in used]), [self.chosen[i][1] for i in used]
+        return Allocation(family, place, weight[used], self.value(weight), bound, proof, rounds)
 
     def value(self, weight: Float[np.ndarray, " s"]) -> float:
         """The criterion f(w)."""
@@ -407,17 +412,15 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         proof = lower_bound(problem, active_problem.covariance(weight), shares)
         bound = proof.value(problem.budget)
         best = proof if best is None or bound > best_bound else best
-        better = (
-            plan is None or bound > best_bound * (1 + 1e-2 * gap) or value < plan.value * (1 - 1e-2 * gap)
-        )
+        least = 1e-2 * gap
+        better = plan is None or bound > best_bound * (1 + least) or value < plan.value * (1 - least)
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
         least = _LEAST_WEIGHT * problem.budget
-        plan = _plan(active_problem, weight, least, value, best_bound, best, turn)
+        plan = active_problem.plan(weight, least, best_bound, best, turn)
         if progress is not None:
-            progress(
-                f"round {turn}: criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
-            )
+            numbers = f"criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
+            progress(f"round {turn}: {numbers}")
         exact = accuracy <= 0.5 * gap
         if plan.gap <= gap or (exact and idle >= _PATIENCE):
             break
@@ -437,21 +440,6 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
 
 def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.ndarray, " _"]]) -> bool:
     return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=_ONE_PLACE, rtol=0.0))
-
-
-def _plan(
-    some: _Some,
-    weight: Float[np.ndarray, " s"],
-    least: float,
-    value: float,
-    bound: float,
-    proof: Bound,
-    rounds: int,
-) -> Allocation:
-    """The candidates that cost more than `least` with their weights."""
-    used = np.flatnonzero(weight * some.costs > least)
-    family, place = np.array([some.chosen[i][0] for i in used]), [some.chosen[i][1] for i in used]
-    return Allocation(family, place, weight[used], value, bound, proof, rounds)
 
 
 def lower_bound(
@@ -485,7 +473,6 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
     The budget of the plan is Σ weight · cost. Raises as `optimise`, and NotEstimableError for a value that more and
     more of the candidates does not reach.
     """
-
     problem = experiment.reduced()
 
     def best(budget: float) -> Allocation:
@@ -519,8 +506,7 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
         raise ValueError(
             f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {chosen.costs.min():g}"
         )
-    count = np.floor(plan.weight + 1e-9)
-    count = _filled(chosen, count, plan.weight)
+    count = _filled(chosen, np.floor(plan.weight + 1e-9), plan.weight)
     if chosen.value(count) > _HOPELESS * plan.value:
         raise NotEstimableError(
             f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates, which do not determine all "
@@ -530,7 +516,7 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
         chosen, count, better = _exchanged(chosen, count)
         if not better:
             break
-    return _plan(chosen, count, 0.0, chosen.value(count), plan.bound, plan.proof, plan.rounds)
+    return chosen.plan(count, 0.0, plan.bound, plan.proof, plan.rounds)
 
 
 def worth(

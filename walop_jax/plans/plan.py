@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.inspection import about_exposures
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans.available import Available
+from walop_jax.plans.available import Available, with_stops
 from walop_jax.plans.criteria import (
     APART,
     NAMED,
@@ -151,9 +151,7 @@ class ExposurePlan(Displayed):
         document: dict[str, Any] = {
             "minutes": self.minutes,
             "seconds": self.seconds,
-            "exposures": [
-                dataclasses.asdict(line) | {"positions": dict(line.positions)} for line in self.lines
-            ],
+            "exposures": [dataclasses.asdict(line) for line in self.lines],
             "criterion": self.criterion.name,
             "what": self.criterion.what,
             "unit": self.criterion.unit,
@@ -190,10 +188,8 @@ class ExposurePlan(Displayed):
             "proof": f"no plan of this time gets {better} {digits(self.bound, '.3g')}{unit}",
         }
         if self.share is not None:
-            measurable = np.isfinite(self.after).all(axis=0)
-            without, middle = (
-                100.0 * np.median(errors[:, measurable]) for errors in (self.before, self.after)
-            )
+            seen = np.isfinite(self.after).all(axis=0)
+            without, middle = (100.0 * np.median(errors[:, seen]) for errors in (self.before, self.after))
             facts["over the field"] = (
                 f"error of p {middle:.3g} % (median over the field; {without:.3g} % without them), below 0.1 % "
                 f"in {100 * self.share:.0f} % of the field where one exposure measures u"
@@ -261,14 +257,9 @@ def plan_exposures(
     if apart:
         criterion, goal = APART, NAMED if goal is None else goal
     choices = candidates(
-        Available.of(available),
-        draws=draws,
-        seed=seed,
-        around=known,
-        effects=apart,
-        catalogue=catalogue,
+        Available.of(available), draws=draws, seed=seed, around=known, effects=apart, catalogue=catalogue,
         progress=progress,
-    )
+    )  # fmt: skip
     if progress is not None:
         progress("criterion")
     two_arms = len(choices.model.template.cameras.pairs) == 2
@@ -325,12 +316,13 @@ def plan_from(
             reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
             endless = (f"{criterion.what}: {reason}; add other settings to the candidates",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
-    plan = dataclasses.replace(
-        chosen.available.plan,
-        stops=tuple(chosen.choices[line.choice].stop(line.place, line.times) for line in lines),
-        patches=(),
-        stars=(),
-        spacing=round(minutes / max(sum(line.times for line in lines), 1), 3),
+    stops = (chosen.choices[line.choice].stop(line.place, line.times) for line in lines)
+    spacing = round(minutes / max(sum(line.times for line in lines), 1), 3)
+    plan = with_stops(chosen.available.plan, stops, spacing=spacing)
+    none = np.zeros((len(found.values), 0))
+    before, after = (
+        none if field is None else field.error(covariance(information))
+        for information in (experiment.known, total)
     )
     # Earlier measurements may hold what these lack.
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
@@ -346,8 +338,8 @@ def plan_from(
         needed=needed,
         x=np.zeros(0) if field is None else field.x,
         y=np.zeros(0) if field is None else field.y,
-        before=_errors(found, field, covariance(experiment.known)),
-        after=_errors(found, field, covariance(total)),
+        before=before,
+        after=after,
         beside=dict(_beside(found, problem, criterion)),
         observing_plan=plan,
         notes=(*found.notes, *endless, *unseen, *chosen.available.doubts(plan)),
@@ -368,7 +360,6 @@ def experiment_of(
     if pairs is None:
         prior = np.broadcast_to(before, (len(criterion.targets), *before.shape)).copy()
         return Experiment(prior, criterion.targets, families, budget)
-
     families = tuple(family.turned(pairs) for family in families)
     # Where a rival has fewer parameters than another the rest are known.
     idle = np.stack([np.diag(1.0 * ~pair.any(axis=0)) for pair in pairs])
@@ -376,16 +367,9 @@ def experiment_of(
     return Experiment(prior, criterion.targets, families, budget, len(pairs))
 
 
-def _errors(
-    found: Candidates, field: FieldErrors | None, covariances: Float[np.ndarray, "r f f"]
-) -> Float[np.ndarray, "r p"]:
-    return np.zeros((len(found.values), 0)) if field is None else field.error(covariances)
-
-
 def _cost(experiment: Experiment, weights: Weights) -> float:
-    return sum(
-        w * float(experiment.families[f].cost_at(np.atleast_2d(p))[0]) for (f, p), w in weights.items()
-    )
+    families = experiment.families
+    return sum(w * float(families[f].cost_at(np.atleast_2d(p))[0]) for (f, p), w in weights.items())
 
 
 # ------------------------------------------------------------------------------------------ whole, and in order
@@ -401,8 +385,8 @@ def _at_few_angles(
         number, place, weight = int(weights.family[i]), weights.place[i], float(weights.weight[i])
         if number in free:
             angle = float(found.choices[number].stop(place).plate or 0.0)
-            near = [a for a in angles if abs((a - angle + 90.0) % 180.0 - 90.0) < _ALIKE]
-            angles[near[0] if near else angle] = angles.get(near[0] if near else angle, 0.0) + weight
+            near = next((a for a in angles if abs((a - angle + 90.0) % 180.0 - 90.0) < _ALIKE), angle)
+            angles[near] = angles.get(near, 0.0) + weight
     order = sorted(angles, key=lambda a: -angles[a])
     best, failure = None, None
     for count in range(len(order) + 1):
@@ -457,9 +441,8 @@ def _within(
                 f"{budget / 60:g} minutes: changes of filter, moving elements and pointing alone take "
                 f"{changes / 60:.1f}; give more time, or fewer filters and settings"
             )
-        problem = dataclasses.replace(
-            experiment, families=tuple(experiment.families[i] for i in allowed), budget=remaining
-        )
+        families = tuple(experiment.families[i] for i in allowed)
+        problem = dataclasses.replace(experiment, families=families, budget=remaining)
         scaled = dataclasses.replace(
             weights,
             family=np.array([allowed.index(weights.family[i]) for i in at]),
@@ -501,10 +484,10 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
 
 def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]]:
     """Right ascension and declination (deg)."""
-    stops = tuple(found.choices[line.choice].stop(line.place) for line in lines)
-    if not stops:
+    if not lines:
         return []
-    exposures = dataclasses.replace(found.available.plan, stops=stops, patches=(), stars=()).exposures()
+    stops = (found.choices[line.choice].stop(line.place) for line in lines)
+    exposures = with_stops(found.available.plan, stops).exposures()
     return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
 
 
@@ -574,9 +557,8 @@ def usual_plans(found: Candidates) -> Iterator[tuple[str, dict[tuple[int, tuple[
     for name, (angles, everywhere, patches) in USUAL.items():
         if (everywhere and len(order) < 2) or (patches and moon is None):
             continue
-        weights = {
-            (i, found.choices[i].place(a)): 1.0 for i in (order if everywhere else order[:1]) for a in angles
-        }
+        where = order if everywhere else order[:1]
+        weights = {(i, found.choices[i].place(angle)): 1.0 for i in where for angle in angles}
         if patches and moon is not None:
             count = len(found.choices[moon].stops)
             weights |= {(moon, (float(k),)): patches / count for k in range(count)}

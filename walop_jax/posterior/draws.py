@@ -45,13 +45,14 @@ def as_arviz(groups: DataTree) -> Any:
     return arviz.InferenceData(**data)
 
 
-def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]]) -> Dataset:
-    """Draws of quantities as a group: chains × draws, by number."""
+def group_of_draws(draws: Mapping[str, Float[np.ndarray, "c d"]], units: Mapping[str, str] = {}) -> Dataset:
+    """Draws of quantities, with units of some, as a group: chains × draws, by number."""
     from xarray import Dataset
 
     chains, count = next(iter(draws.values())).shape
     place = {"chain": np.arange(chains), "draw": np.arange(count)}
-    return Dataset({name: (("chain", "draw"), values) for name, values in draws.items()}, coords=place)
+    dims, about = ("chain", "draw"), {name: {"units": unit or "1"} for name, unit in units.items()}
+    return Dataset({name: (dims, values, about.get(name)) for name, values in draws.items()}, coords=place)
 
 
 def digest(*items: Any) -> str:
@@ -82,13 +83,6 @@ def read_groups(path: str | os.PathLike[str]) -> DataTree:
         raise fail(f"cannot be read: {error}", file=path, advice=_AGAIN) from error
 
 
-def _groups_of(given: Any) -> Any:
-    """The groups of a `posterior.nc` or a `PosteriorSample`; those of `Run.posterior` and `to_arviz` as they are."""
-    if isinstance(given, str | os.PathLike):
-        return read_groups(given)
-    return given.groups() if hasattr(given, "draws") else given  # ArviZ 0.x has a `groups` that lists names
-
-
 def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Float[np.ndarray, "d n"]:
     """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
 
@@ -96,7 +90,10 @@ def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Flo
     `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
     read, is of another model or another fit, or may not be trusted.
     """
-    groups, path = _groups_of(path), path if isinstance(path, str | os.PathLike) else "the posterior"
+    if isinstance(path, str | os.PathLike):
+        groups = read_groups(path)
+    else:  # `Run.posterior` and `to_arviz` are groups already; ArviZ 0.x has a `groups` that lists names
+        groups, path = path.groups() if hasattr(path, "draws") else path, "the posterior"
     try:
         posterior = groups["posterior"]
         fixed = json.loads(posterior.attrs["fixed"])
@@ -119,20 +116,14 @@ def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Flo
 
 
 def with_draws(calibration: Calibration, path: Any, count: int = DRAWS) -> Calibration:
-    """The calibration with `count` draws of a posterior, in a file or in memory, over which its matrices are averaged.
-
-    `DataError` for a file of another model or another fit, or not trusted.
-    """
+    """The calibration with `count` draws of a posterior, a file or in memory, over which its matrices are averaged."""
     draws = _draws_of(calibration, path)
     chosen = np.random.default_rng(0).permutation(len(draws))[:count]
     return dataclasses.replace(calibration, draws=draws[chosen])
 
 
 def with_moments(calibration: Calibration, path: Any) -> Calibration:
-    """The calibration with mean and covariance of all draws of a `posterior.nc` in place of the fit's.
-
-    For linear propagation, star by star. `DataError` as in `with_draws`.
-    """
+    """The calibration with mean and covariance of all draws of a posterior, for linear propagation, star by star."""
     draws = _draws_of(calibration, path)
     return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
 

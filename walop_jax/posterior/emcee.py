@@ -50,9 +50,8 @@ class Emcee(Sampler):
         d = density.dimension
         count = self.walkers or max(LEAST_WALKERS, 2 * d)
         if count < 2 * d or count % 2:
-            raise ValueError(
-                f"{count} walkers for {d} sampled coefficients: an even number of at least {2 * d}"
-            )
+            what = f"{count} walkers for {d} sampled coefficients"
+            raise ValueError(f"{what}: an even number of at least {2 * d}")
         random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
         positions = random.standard_normal((count, d))
         value = density.log_density(positions)
@@ -65,9 +64,8 @@ class Emcee(Sampler):
         import emcee
 
         count, dimension = state["positions"].shape
-        sampler = emcee.EnsembleSampler(
-            count, dimension, density.log_density, vectorize=True, moves=mixture(self.moves)
-        )
+        how = {"vectorize": True, "moves": mixture(self.moves)}
+        sampler = emcee.EnsembleSampler(count, dimension, density.log_density, **how)
         random = tuple(random_attributes(state).values())
         current = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
         positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))
@@ -108,14 +106,11 @@ def mixture(moves: str) -> list[tuple[Any, float]]:
     """Return emcee's moves with their shares; ValueError for an unknown name."""
     from emcee import moves as made
 
-    evolution = [(made.DEMove(), 1.0 - JUMPS), (made.DEMove(gamma0=1.0), JUMPS)]
-    if moves == "laplace":
-        return [
-            (made.MHMove(_laplace_draws), 0.5),
-            *((move, 0.5 * share) for move, share in evolution),
-        ]
-    if moves == "de":
-        return evolution
+    if moves not in MOVES:
+        raise ValueError(f"there are no moves {moves!r}: choose one of {', '.join(MOVES)}")
     if moves == "stretch":
         return [(made.StretchMove(), 1.0)]
-    raise ValueError(f"there are no moves {moves!r}: choose one of {', '.join(MOVES)}")
+    evolution = [(made.DEMove(), 1.0 - JUMPS), (made.DEMove(gamma0=1.0), JUMPS)]
+    if moves == "de":
+        return evolution
+    return [(made.MHMove(_laplace_draws), 0.5), *((move, 0.5 * share) for move, share in evolution)]

@@ -17,7 +17,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
@@ -30,10 +29,7 @@ _ADVICE = "sample into another folder, or start anew with --overwrite"
 
 
 def write_posterior(path: str | os.PathLike[str], sample: PosteriorSample) -> None:
-    """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's.
-
-    It appears whole or not at all. Raises `DataError` as `atomic_path` does.
-    """
+    """Write `posterior.nc` (netCDF 4), a group for each of ArviZ's, whole or not at all."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
@@ -63,10 +59,7 @@ def _write_hdf5(
 
 
 class Chain:
-    """The chain of emcee in the folder of a run: `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it.
-
-    `fingerprint` identifies data, model and options of the sample.
-    """
+    """The chain of emcee in the folder of a run, as `emcee.backends.HDFBackend(path, name="ensemble0")`, … reads it."""
 
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
@@ -80,50 +73,32 @@ class Chain:
             for number, (state, stretch) in enumerate(zip(states, stretches, strict=True)):
                 steps, walkers, dimension = stretch.positions.shape
                 group = file.create_group(f"ensemble{number}")
-                group.attrs.update(
-                    {"version": "3", "nwalkers": walkers, "ndim": dimension, "has_blobs": False}
-                )
-                group.attrs.update({"iteration": steps, **random_attributes(state)})
+                size = {"nwalkers": walkers, "ndim": dimension, "iteration": steps}
+                group.attrs.update({"version": "3", "has_blobs": False, **size, **random_attributes(state)})
                 group["chain"], group["log_prob"] = stretch.positions, stretch.log_density
                 group["accepted"] = stretch.acceptance.sum(axis=0)
 
         _write_hdf5(self.path, fill, overwrite=True)
 
     def load(self) -> tuple[list[State], list[Stretch], float]:
-        """All ensembles, their states at the end, and the seconds that they took.
-
-        `DataError` for a file that cannot be read, and for one of anything else.
-        """
+        """All ensembles, their states at the end, and seconds; `DataError` for a file of another sample."""
         from emcee.backends import HDFBackend
 
         try:
             with h5py.File(self.path, "r") as file:
-                before, seconds = (
-                    json.loads(str(file.attrs["fingerprint"])),
-                    float(str(file.attrs["seconds"])),
-                )
-                count = len(file)
-            arrays: list[Any] = [
-                HDFBackend(str(self.path), name=f"ensemble{n}", read_only=True) for n in range(count)
-            ]
-            stretches = [Stretch(k.get_chain(), k.get_log_prob(), _shares(k)) for k in arrays]
-            states = [
-                emcee_state(s.positions[-1], s.log_density[-1], k.random_state)
-                for s, k in zip(stretches, arrays, strict=True)
-            ]
+                before, count = json.loads(str(file.attrs["fingerprint"])), len(file)
+                seconds = float(str(file.attrs["seconds"]))
+            path = str(self.path)
+            arrays: list[Any] = [HDFBackend(path, name=f"ensemble{n}", read_only=True) for n in range(count)]
+            # Of the proposals accepted the file has the mean of each walker.
+            shares = (np.repeat(k.accepted[None] / k.iteration, k.iteration, axis=0) for k in arrays)
+            stretches = [Stretch(k.get_chain(), k.get_log_prob(), next(shares)) for k in arrays]
+            ends = ((s.positions[-1], s.log_density[-1]) for s in stretches)
+            states = [emcee_state(*end, k.random_state) for end, k in zip(ends, arrays, strict=True)]
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error
         keys = sorted({*before, *self.fingerprint})
-        changed = [key for key in keys if before.get(key) != self.fingerprint.get(key)]
-        if changed:
-            what = ", ".join(
-                f"{k} ({before.get(k, 'none')[:12]} → {self.fingerprint.get(k, 'none')[:12]})"
-                for k in changed
-            )
-            raise fail(f"was sampled with other {what}", file=self.path, advice=_ADVICE)
+        pairs = {key: (before.get(key, "none"), self.fingerprint.get(key, "none")) for key in keys}
+        if changed := [f"{k} ({a[:12]} → {b[:12]})" for k, (a, b) in pairs.items() if a != b]:
+            raise fail(f"was sampled with other {', '.join(changed)}", file=self.path, advice=_ADVICE)
         return states, stretches, seconds
-
-
-def _shares(kept: Any) -> Float[np.ndarray, "n w"]:
-    """Shares of proposals accepted: of a chain that was kept, the mean of each walker."""
-    return np.repeat(kept.accepted[None] / kept.iteration, kept.iteration, axis=0)

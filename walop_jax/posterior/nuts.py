@@ -57,12 +57,8 @@ class Nuts(Sampler):
         ):
             tuning[0] = learn(tuning[0], info.acceptance_rate)
             first = np.asarray(chain.position)
-        return {
-            "position": first,
-            "key": key,
-            "step_size": np.array(settled(tuning[0]) if self.warm_up else FIRST_STEP),
-            "steps": np.array(self.warm_up),
-        }
+        size = np.array(settled(tuning[0]) if self.warm_up else FIRST_STEP)
+        return {"position": first, "key": key, "step_size": size, "steps": np.array(self.warm_up)}
 
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
         """Go on for that many trajectories."""

@@ -44,9 +44,7 @@ LENGTHS = 50.0  # in units of τ
 STABLE = 0.25  # allowed relative change of τ over each of two doublings
 LARGEST_RHAT = 1.01
 LEAST_STORED = 40  # steps, below which nothing is said
-RANKED = (
-    100_000  # positions per quantity that R-hat looks at: sorting more would take longer than sampling them
-)
+RANKED = 100_000  # positions per quantity that R-hat looks at: sorting more takes longer than sampling them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +76,10 @@ class Convergence:
     def message(self, seconds_per_step: float = math.nan) -> str:
         """One sentence for people."""
         if self.converged:
-            return (
-                f"converged: {self.steps} steps, {self.steps / self.tau.max():.0f} τ, "
-                f"τ = {self.tau.max():.1f}, at least {self.ess.min():.0f} effective samples, "
-                f"R-hat {self.rhat.max():.4f}"
-            )
+            tau = self.tau.max()
+            length = f"{self.steps} steps, {self.steps / tau:.0f} τ, τ = {tau:.1f}"
+            samples = f"at least {self.ess.min():.0f} effective samples, R-hat {self.rhat.max():.4f}"
+            return f"converged: {length}, {samples}"
         time = "" if not np.isfinite(seconds_per_step) else f" (about {self.needed * seconds_per_step:.0f} s)"
         reasons = "; ".join(self.reasons)
         return f"NOT converged: {reasons}. Go on for {self.needed} steps or more{time} with --resume"
@@ -137,13 +134,10 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
         "exposure": ("row", calset.exposures.exposure[exposure]),
         "camera": list(likelihood.model.template.cameras.names),
     }
+    x, y, errors = calset.points.x[point], calset.points.y[point], 1.0 / gathered("weight")[used]
     columns = {
         "observed_data": {"N": gathered("counts")[used]},
-        "constant_data": {
-            "N_ERR": 1.0 / gathered("weight")[used],
-            "X": calset.points.x[point],
-            "Y": calset.points.y[point],
-        },
+        "constant_data": {"N_ERR": errors, "X": x, "Y": y},
     }
     dims = ("row", "camera")
     return {
@@ -160,9 +154,8 @@ def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
     normal = functools.partial(np.random.default_rng(seed).multivariate_normal, method="eigh")
     drawn = result.values[varies] + size[varies] * normal(np.zeros(len(varies)), correlation, (4, draws))
     names = [parameters[i].name for i in varies]
-    posterior = group_of_draws({name: drawn[..., k] for k, name in enumerate(names)})
-    for i, name in zip(varies, names, strict=True):
-        posterior[name].attrs["units"] = parameters[i].unit or "1"
+    units = {parameters[i].name: parameters[i].unit for i in varies}
+    posterior = group_of_draws({name: drawn[..., k] for k, name in enumerate(names)}, units)
     trusted = result.verdict is not None and result.trusted
     posterior.attrs.update(sampler="none: covariance of the fit", trusted=int(trusted))
     from xarray import DataTree
@@ -171,26 +164,14 @@ def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
     return as_arviz(DataTree.from_dict({"posterior": posterior, **rows}))
 
 
-def interval_in_words(row: Any) -> dict[str, str]:
-    """A row of `PosteriorSample.intervals` as texts: median, half the 68 % interval, ends of that of 95 %."""
-    half = 0.5 * float(row["HIGH68"] - row["LOW68"])
-    low, high = (value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH"))
-    median, sigma = value_and_error(float(row["MEDIAN"]), half)
-    names = {"name": str(row["NAME"]), "unit": str(row["UNIT"]), "ess": f"{float(row['ESS']):.0f}"}
-    return names | {"low": low, "high": high, "median": median, "sigma": sigma}
-
-
 def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence:
     """Apply the rules to chains stored every `thin` steps, burn-in taken off."""
     n, k = chains.shape[1], chains.shape[-1]
     steps = n * thin
     if n < LEAST_STORED:
-        nothing = np.full(k, np.nan)
-        needed = LEAST_STORED * thin - steps
+        nothing, needed, history = np.full(k, np.nan), LEAST_STORED * thin - steps, (np.nan, np.nan, np.nan)
         reason = f"{steps} steps are too few to judge"
-        return Convergence(
-            names, steps, nothing, (np.nan, np.nan, np.nan), np.zeros(k), nothing, needed, (reason,)
-        )
+        return Convergence(names, steps, nothing, history, np.zeros(k), nothing, needed, (reason,))
     quarter, half, tau = (autocorrelation(chains[:, :m]) * thin for m in (n // 4, n // 2, n))
     rhat = r_hat(chains)
     history = (float(np.max(quarter)), float(np.max(half)), float(np.max(tau)))
@@ -199,9 +180,8 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
         stuck = [name for name, value in zip(names, tau, strict=True) if not np.isfinite(value)]
         return Convergence(names, steps, tau, history, np.zeros(k), rhat, steps, (f"{stuck[0]} never moved",))
     if steps <= LENGTHS * history[2]:
-        reasons.append(
-            f"{steps} steps are {steps / history[2]:.0f} τ of {history[2]:.0f}, fewer than {LENGTHS:.0f}"
-        )
+        lengths = f"{steps / history[2]:.0f} τ of {history[2]:.0f}"
+        reasons.append(f"{steps} steps are {lengths}, fewer than {LENGTHS:.0f}")
         needed = max(needed, math.ceil(1.1 * LENGTHS * history[2]) - steps)
     changes = [abs(b / a - 1.0) if a > 0 else np.inf for a, b in itertools.pairwise(history)]
     if not max(changes) < STABLE:
@@ -340,9 +320,8 @@ class PosteriorSample(Drawn):
         """Sentences about everything that does not hold."""
         sentences = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
         if not self.of_trusted_fit:
-            sentences.insert(
-                0, "the fit is not trusted, and neither is its posterior: see the warnings of the fit"
-            )
+            what = "the fit is not trusted, and neither is its posterior: see the warnings of the fit"
+            sentences.insert(0, what)
         a = self.accuracy
         if a is not None and not a.exact_enough:
             sentences.append(
@@ -351,10 +330,8 @@ class PosteriorSample(Drawn):
                 f"weights {a.efficiency:.2f} effective; sample fewer or better determined coefficients, or "
                 "take the sampler nuts"
             )
-        if self.counts.get("divergences", 0):
-            sentences.append(
-                f"{self.counts['divergences']} trajectories of the sampler diverged: tails may be missing"
-            )
+        if lost := self.counts.get("divergences", 0):
+            sentences.append(f"{lost} trajectories of the sampler diverged: tails may be missing")
         return tuple(sentences)
 
     @property
@@ -363,10 +340,8 @@ class PosteriorSample(Drawn):
         a = self.accuracy
         if a is None:
             return f"sampled with {self.sampler} from the exact posterior of all coefficients"
-        return (
-            f"against the exact posterior at {a.count} draws: means within {abs(a.shift[1]):.3f} σ, "
-            f"widths within {100 * abs(a.width[1] - 1):.1f} %"
-        )
+        agreement = f"means within {abs(a.shift[1]):.3f} σ, widths within {100 * abs(a.width[1] - 1):.1f} %"
+        return f"against the exact posterior at {a.count} draws: {agreement}"
 
     @property
     def varying(self) -> list[int]:
@@ -436,14 +411,11 @@ class PosteriorSample(Drawn):
         if likelihood is None:
             raise ValueError("the data are not at hand: sample the fit, or the run, again")
         if likelihood.plan.exposures.shared is not None:
-            raise ValueError(
-                "exposures share their flux (KIND steady): their rows cannot be left out one by one"
-            )
+            what = "exposures share their flux (KIND steady)"
+            raise ValueError(f"{what}: their rows cannot be left out one by one")
         if not likelihood.sharing.single:
-            raise ValueError(
-                "exposures share q and u of the stars of a field (SCATTER of SOURCES): their rows cannot be left out "
-                "one by one"
-            )
+            what = "exposures share q and u of the stars of a field (SCATTER of SOURCES)"
+            raise ValueError(f"{what}: their rows cannot be left out one by one")
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)
         chi2 = np.empty((*self.draws.shape[:2], int(used.sum())))
         for at in np.ndindex(chi2.shape[:2]):
@@ -470,9 +442,7 @@ class PosteriorSample(Drawn):
         draws = {self.names[i]: self.draws[:, :, i] for i in varies}
         if self.ln_f is not None:
             draws[INFLATION] = self.ln_f
-        posterior = group_of_draws(draws)
-        for i in varies:
-            posterior[self.names[i]].attrs["units"] = self.units[i] or "1"
+        posterior = group_of_draws(draws, {self.names[i]: self.units[i] for i in varies})
         v = self.convergence
         for k, name in enumerate(v.names):
             if name not in posterior:  # it never moved
@@ -515,11 +485,13 @@ class PosteriorSample(Drawn):
     def display(self) -> Display:
         """The verdict on the chains and the sampled coefficients."""
         table = self.to_table()
-        intervals = map(interval_in_words, table[np.isin(np.asarray(table["NAME"]), self.sampled)])
-        rows = [
-            (t["name"], t["median"], t["sigma"], t["unit"], f"{t['low']} … {t['high']}", t["ess"])
-            for t in intervals
-        ]
+        rows = []
+        for row in table[np.isin(np.asarray(table["NAME"]), self.sampled)]:
+            half = 0.5 * float(row["HIGH68"] - row["LOW68"])
+            low, high = (value_and_error(float(row[f"{end}95"]), half)[0] for end in ("LOW", "HIGH"))
+            median = value_and_error(float(row["MEDIAN"]), half)
+            ess = f"{float(row['ESS']):.0f}"
+            rows.append((str(row["NAME"]), *median, str(row["UNIT"]), f"{low} … {high}", ess))
         return Display(
             title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",
             facts=(("sampler", self.sampler), ("chains", self.convergence.message())),

@@ -96,10 +96,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     @functools.cached_property
     def calset(self) -> CalibrationSet:
-        """The data of the fit.
-
-        Raises `DataError` where the run does not name them, and where they are missing or have changed.
-        """
+        """The data of the fit; `DataError` where the run does not name them, or they are missing or have changed."""
         inputs = () if self.product is None else self.product.inputs
         if not inputs:
             advice = "make it with walop-jax refit"
@@ -115,11 +112,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             for candidate in (folder / path, folder / path.name):
                 if candidate.exists():
                     return candidate
-        raise fail(
-            f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}",
-            file=path,
-            advice="give its place (--data FILE, for each set of the fit), or copy it into the folder of the run",
+        advice = (
+            "give its place (--data FILE, for each set of the fit), or copy it into the folder of the run"
         )
+        what = f"cannot be found, neither from {Path.cwd()} nor beside {self.folder}"
+        raise fail(what, file=path, advice=advice)
 
     def fit(self, model_text: str | None = None) -> FitResult:
         """The fit of the run, made once more from where it ended; `model_text` is the model file of the fit.
@@ -130,40 +127,35 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         """
         diagnosis = self.documents.get("diagnosis", {})
         if diagnosis.get("members") or diagnosis.get("shape"):
-            raise fail(
-                A_MEAN,
-                file=self.folder,
-                advice=f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run",
-            )
+            advice = f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run"
+            raise fail(A_MEAN, file=self.folder, advice=advice)
         calibration, calset = self.rebuilt, self.calset
         text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
+        advice = "run walop-jax refit with this model and version first"
         if model.names != calibration.model.names:
-            advice = "run walop-jax refit with this model first"
             raise fail("was fitted with another model", file=self.folder, advice=advice)
         likelihood = Likelihood.of(calset, model)
         if likelihood.layout.large:
-            raise fail(
-                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and "
-                "calibration.fits holds its covariance",
-                file=calibration.inputs[0].path,
-                advice=f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one",
+            what = (
+                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and"
             )
+            advice = (
+                f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one"
+            )
+            path = calibration.inputs[0].path
+            raise fail(f"{what} calibration.fits holds its covariance", file=path, advice=advice)
         result = fit(likelihood, start=calibration.values)
         away = np.abs(result.values - calibration.values) / np.where(result.sigma > 0, result.sigma, 1.0)
         if not result.converged or np.max(away) > SAME_FIT:
-            name = model.names[int(np.argmax(away))]
-            raise fail(
-                f"fitted again, {name} moves by {np.max(away):.2g} standard errors", file=self.folder,
-                advice="run walop-jax refit with this model and version first",
-            )  # fmt: skip
+            what = f"{model.names[int(np.argmax(away))]} moves by {np.max(away):.2g} standard errors"
+            raise fail(f"fitted again, {what}", file=self.folder, advice=advice)
         if calibration.verdict.errors_from != STATED:
             result = with_honest_errors(result)
         verdict = calibration.verdict
         if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
-            result = dataclasses.replace(
-                result, covariance=calibration.covariance, errors_from=verdict.errors_from
-            )
+            errors = {"covariance": calibration.covariance, "errors_from": verdict.errors_from}
+            result = dataclasses.replace(result, **errors)
         return dataclasses.replace(result, verdict=verdict)
 
     def display(self) -> Display:
@@ -178,11 +170,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             facts.append(
                 ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
             )
-        facts += [
-            (name, document["shown"]["title"])
-            for name, document in documents.items()
-            if "shown" in document and name != "summary"
-        ]
+        others = {n: d["shown"]["title"] for n, d in documents.items() if "shown" in d and n != "summary"}
+        facts += others.items()
         inner = Display("") if self.calibration is None else self.calibration.display()
         return dataclasses.replace(
             inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)

@@ -23,10 +23,7 @@ from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail, nearest
 from walop_jax.model.compiled import compiled
 
-SAMPLERS = {
-    "emcee": "walop_jax.posterior.emcee:Emcee",
-    "nuts": "walop_jax.posterior.nuts:Nuts",
-}
+SAMPLERS = {"emcee": "walop_jax.posterior.emcee:Emcee", "nuts": "walop_jax.posterior.nuts:Nuts"}
 """One line for each sampler: its name, and module and class."""
 
 Positions = Float[np.ndarray, "n k"]
@@ -129,10 +126,8 @@ def make_sampler(
         module, name = SAMPLERS[sampler].split(":")
         kind = getattr(importlib.import_module(module), name)
     else:
-        raise fail(
-            f"there is no sampler {sampler!r}",
-            advice=f"choose one of {', '.join(SAMPLERS)}, or give your own as FILE.py:CLASS",
-        )
+        advice = f"choose one of {', '.join(SAMPLERS)}, or give your own as FILE.py:CLASS"
+        raise fail(f"there is no sampler {sampler!r}", advice=advice)
     if not isinstance(getattr(kind, "name", None), str):
         raise fail(f"the sampler {sampler!r} has no name", advice='write name = "…" into its class')
     _check_settings(kind, settings)

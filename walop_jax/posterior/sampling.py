@@ -39,17 +39,16 @@ Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
+OF_LENGTH, OF_SAMPLER = ("maximum_steps", "draws", "checks"), ("sampler", "walkers", "moves")
+"""Options that do not change a chain, its length and summary, and those that have an entry of their own."""
 
 
 class Ensembles:
     """The ensembles of a run and their stored steps: every `thin`-th step of blocks of `interval` steps."""
 
-    def __init__(
-        self, sampler: Sampler, density: Density, options: Options, chain: Chain | None = None
-    ) -> None:
+    def __init__(self, sampler: Sampler, density: Density, options: Options, chain: Chain | None = None):
         """Resumes from `chain` where it exists, or starts."""
-        self.sampler, self.density = sampler, density
-        self.options, self.chain = options, chain
+        self.sampler, self.density, self.options, self.chain = sampler, density, options, chain
         self.thin = options.thin or sampler.thin
         self.blocks: list[list[Stretch]] = []
         if chain is not None and chain.path.exists():
@@ -91,14 +90,11 @@ class Ensembles:
 
     def go_on(self) -> None:
         """One more block."""
-        began, options = time.perf_counter(), self.options
-        states, stretches = [], []
-        for state in self.states:
-            state, stretch = self.sampler.advance(self.density, state, options.interval)
-            states.append(dict(state))
-            stretches.append(self._stored(stretch))
-        seconds = time.perf_counter() - began
-        self.states, self.seconds = states, self.seconds + seconds
+        began, interval = time.perf_counter(), self.options.interval
+        advanced = [self.sampler.advance(self.density, state, interval) for state in self.states]
+        stretches = [self._stored(stretch) for _, stretch in advanced]
+        self.states = [dict(state) for state, _ in advanced]
+        self.seconds += time.perf_counter() - began
         self.blocks.append(stretches)
         if self.chain is not None:
             self.chain.save(self.states, self.stretches, self.seconds)
@@ -108,11 +104,10 @@ class Ensembles:
         shape = np.shape(stretch.positions)
         shapes = (np.shape(stretch.log_density), np.shape(stretch.acceptance))
         if len(shape) != 3 or (shape[0], shape[2]) != (n, k) or shapes != (shape[:2], shape[:2]):
-            raise fail(
-                f"the sampler {self.sampler.name!r} gave positions of shape {shape} and numbers of shapes {shapes}",
-                advice=f"for {n} steps of {k} coordinates it must be (steps, walkers, coordinates) = ({n}, …, {k}), "
-                "and (steps, walkers)",
-            )
+            name, wanted = self.sampler.name, f"(steps, walkers, coordinates) = ({n}, …, {k})"
+            what = f"the sampler {name!r} gave positions of shape {shape} and numbers of shapes {shapes}"
+            advice = f"for {n} steps of {k} coordinates it must be {wanted}, and (steps, walkers)"
+            raise fail(what, advice=advice)
         stored = (np.array(series[self.thin - 1 :: self.thin], float) for series in stretch[:3])
         return Stretch(*stored, counts=stretch.counts)
 
@@ -129,24 +124,22 @@ class Ensembles:
 
         Judged are the quantities that `monitored` makes of positions, under their `names`.
         """
+        most = self.options.maximum_steps
         while True:
             verdict = None
             if self.blocks:
                 verdict = assess(monitored(self.kept()[0]), tuple(names), self.thin)
-                if verdict.converged or self.steps + self.options.interval > self.options.maximum_steps:
+                if verdict.converged or self.steps + self.options.interval > most:
                     return verdict
             if report is not None:
-                goal = self.options.maximum_steps if verdict is None else self.steps + verdict.needed
-                done = min(self.steps / max(goal, 1), 1.0)
-                report(Progress("sampling", done, *numbers_of(verdict)))
+                goal = most if verdict is None else self.steps + verdict.needed
+                report(Progress("sampling", min(self.steps / max(goal, 1), 1.0), *numbers_of(verdict)))
             self.go_on()
 
 
 def numbers_of(verdict: Convergence | None) -> tuple[float, float]:
     """Worst τ and fewest effective samples, for a progress bar; NaN before the first verdict."""
-    if verdict is None:
-        return float("nan"), float("nan")
-    return verdict.history[2], float(np.min(verdict.ess))
+    return (np.nan, np.nan) if verdict is None else (verdict.history[2], float(np.min(verdict.ess)))
 
 
 def fingerprint(target: Target, options: Options) -> dict[str, str]:
@@ -157,11 +150,8 @@ def fingerprint(target: Target, options: Options) -> dict[str, str]:
     exposures = [np.asarray(array) for array in jax.tree.leaves(laid_out.exposures)]
     parameters = [(p.name, p.start, p.free, p.tie, p.scale) for p in model.parameters]
     priors = [(p.name, p.prior, p.loose) for p in model.parameters]
-    chain = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    for name in ("maximum_steps", "draws", "checks"):  # length and summary: free to change
-        del chain[name]
-    for name in ("sampler", "walkers", "moves"):  # have an entry of their own
-        del chain[name]
+    names = (f.name for f in dataclasses.fields(options) if f.name not in (*OF_LENGTH, *OF_SAMPLER))
+    chain = {name: getattr(options, name) for name in names}
     sampler = options.make_sampler()
     versions = versions_of((*SOFTWARE, *sampler.software))
     effects = [effect.name for effect in model.template.effects]
@@ -209,13 +199,10 @@ def sample(
     options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)
     if result.errors_from != STATED:
-        stated = dataclasses.replace(
-            result, covariance=covariance(result.model, result.expansion), errors_from=STATED
-        )
+        inverse = covariance(result.model, result.expansion)
+        stated = dataclasses.replace(result, covariance=inverse, errors_from=STATED)
         as_stated = sample(stated, options, folder=folder, resume=resume, report=report)
-        return sandwich_adjusted(
-            as_stated, result.model, stated.covariance, result.covariance, result.errors_from
-        )
+        return sandwich_adjusted(as_stated, result.model, inverse, result.covariance, result.errors_from)
     sampler, target = options.make_sampler(), Target(result)
     marks = {} if folder is None else fingerprint(target, options)
     chain = Chain(folder, marks) if folder is not None and sampler.resumes else None
@@ -223,11 +210,19 @@ def sample(
         if not resume:
             raise fail("holds a chain already", file=folder, advice="go on with --resume, or --overwrite it")
         chain.load()  # a chain of another fit is refused before the work
+    began, sampled = time.perf_counter(), choose_sampled(target, options.parameters)
     if sampler.exact:
-        posterior = ExactPosterior(target, choose_sampled(target, options.parameters), options.inflate)
-        seconds = 0.0
+        posterior = ExactPosterior(target, sampled, options.inflate)
     else:
-        posterior, seconds = _surrogate(target, options, report)
+        posterior = build_surrogate(
+            target,
+            sampled=sampled,
+            order=options.order,
+            inflate=options.inflate,
+            seed=options.seed,
+            progress=lambda done, total: report(Progress("tabulating the model", done / total)),
+        )
+    seconds = time.perf_counter() - began
     report(Progress("starting", 0.0))
     ensembles = Ensembles(sampler, posterior.density(), options, chain)
     verdict = ensembles.until_converged(posterior.monitored_names, posterior.monitored, report)
@@ -235,19 +230,6 @@ def sample(
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
     return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
-
-
-def _surrogate(target: Target, options: Options, report: Report) -> tuple[Surrogate, float]:
-    began = time.perf_counter()
-    surrogate = build_surrogate(
-        target,
-        sampled=choose_sampled(target, options.parameters),
-        order=options.order,
-        inflate=options.inflate,
-        seed=options.seed,
-        progress=lambda done, total: report(Progress("tabulating the model", done / total)),
-    )
-    return surrogate, time.perf_counter() - began
 
 
 def _evenly(count: int, wanted: int) -> Int[np.ndarray, " m"]:

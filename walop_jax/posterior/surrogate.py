@@ -39,7 +39,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model.compiled import compiled
 from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled
+from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled, ln_f_unit
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
@@ -84,7 +84,7 @@ class Surrogate:
     @property
     def ln_f_unit(self) -> float:
         """Change of ln f per unit of its coordinate."""
-        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
+        return ln_f_unit(self.measured)
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
         """1/f² of every draw."""
@@ -156,10 +156,7 @@ class Surrogate:
         return self.centre + z[:, : self.along.shape[1]] @ self.along.T + s @ self.across.T
 
     def moments(self, z: Draws) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
-        """Mean and covariance of all free parameters.
-
-        E and Var of the conditional, averaged over draws (Rao–Blackwell).
-        """
+        """Mean and covariance of all free parameters: E and Var of the conditional, averaged (Rao–Blackwell)."""
         mean, variance = self._conditional(z)
         x = self.place(z, mean @ self.linear.T)
         inner = (self.across @ self.linear) * np.sqrt(variance.mean(axis=0))
@@ -218,17 +215,9 @@ def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix
     follow = np.linalg.solve(axes, c[np.ix_(sampled, marginalised)]).T  # C_λφ A⁻ᵀ
     along, across = np.zeros((len(c), len(sampled))), np.zeros((len(c), len(marginalised)))
     along[sampled], along[marginalised] = axes, follow
-    across[marginalised] = _axes(
-        c[np.ix_(marginalised, marginalised)] - follow @ follow.T, scale[marginalised]
-    )
+    conditional = c[np.ix_(marginalised, marginalised)] - follow @ follow.T
+    across[marginalised] = _axes(conditional, scale[marginalised])
     return along, across
-
-
-def _design(rng: np.random.Generator, odd: int, even: int, width: int) -> Draws:
-    """Points ±u with u normal: odd and even parts of the residuals separate."""
-    pairs = max(0.5 * OVERSAMPLING * (odd + even), LEAST * max(odd, even)) + 1.0
-    half = SPREAD * rng.standard_normal((int(np.ceil(pairs)), width))
-    return np.concatenate([half, -half])
 
 
 def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
@@ -255,10 +244,7 @@ def build_surrogate(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Surrogate:
-    """Fit the surrogate to exact residuals at about 1.5 design points per feature; `order` 2 or 3.
-
-    Raises ValueError for other orders.
-    """
+    """Fit the surrogate (`order` 2 or 3) to exact residuals at about 1.5 design points per feature."""
     if order not in (2, 3):
         raise ValueError(f"order {order}: the surrogate is of order 2 or 3")
     sampled = choose_sampled(target) if sampled is None else sampled
@@ -269,17 +255,16 @@ def build_surrogate(
     triples = np.array(list(itertools.combinations_with_replacement(bent, 3)), int).reshape(-1, 3)
     odd, even = k + len(triples) + s, 1 + len(pairs)
     n_features = odd + even
-    design = _design(np.random.default_rng([seed, 20]), odd, even, k + s)
+    # Points ±u with u normal: odd and even parts of the residuals separate.
+    count = max(0.5 * OVERSAMPLING * n_features, LEAST * max(odd, even)) + 1.0
+    half = SPREAD * np.random.default_rng([seed, 20]).standard_normal((int(np.ceil(count)), k + s))
+    design = np.concatenate([half, -half])
     x = target.centre + design[:, :k] @ along.T + design[:, k:] @ across.T
-    y = np.concatenate(
-        [np.asarray(features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))), design[:, k:]],
-        axis=1,
-    )
+    features = features_of(*(jnp.asarray(a) for a in (design[:, :k], pairs, triples)))
+    y = np.concatenate([np.asarray(features), design[:, k:]], axis=1)
     q, r = np.linalg.qr(y)
-    inverse = np.linalg.solve(r, q.T)
-    gram = _gram(target, x, progress)
-    data = inverse @ gram[1:, 1:] @ inverse.T
-    cross = inverse @ gram[1:, 0]
+    inverse, gram = np.linalg.solve(r, q.T), _gram(target, x, progress)
+    data, cross = inverse @ gram[1:, 1:] @ inverse.T, inverse @ gram[1:, 0]
     data[0] += cross
     data[:, 0] += cross
     data[0, 0] += gram[0, 0]
@@ -307,10 +292,7 @@ def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) 
 def _determinant_slopes(
     target: Target, along: Matrix, across: Matrix
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
-    """Derivatives of ln det H_ss along both kinds of coordinates.
-
-    Columns of `across` make H_ss the unit matrix.
-    """
+    """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
     total, twice = np.zeros(len(target.centre)), 2.0 * target.half_gradient(target.centre)
     for step in across.T:
         up, down = (target.half_gradient(target.centre + sign * step) for sign in (1, -1))
@@ -345,10 +327,8 @@ class Accuracy:
     @property
     def exact_enough(self) -> bool:
         """True where sampling the surrogate is sampling the posterior: means to 0.1 σ, widths to 5 %."""
-        shift, width = (
-            abs(value) - 3.0 * error
-            for value, error in (self.shift[1:], (self.width[1] - 1.0, self.width[2]))
-        )
+        pairs = self.shift[1:], (self.width[1] - 1.0, self.width[2])
+        shift, width = (abs(value) - 3.0 * error for value, error in pairs)
         return bool(np.isfinite(self.spread)) and self.efficiency > 0.5 and shift < 0.1 and width < 0.05
 
 
@@ -359,11 +339,9 @@ def compare_with_exact(target: Target, surrogate: Surrogate, z: Draws, rng: np.r
     Cov(ρ, t) and the exact variance by the factor 1 + Cov(ρ, t²).
     """
     x, weight = surrogate.draw(z, rng), surrogate.weight(z)
-    exact = [
-        w * target.data(point) + float(np.sum(target.prior_rows(point) ** 2))
-        for w, point in zip(weight, x, strict=True)
-    ]
-    ln_ratio = -0.5 * (np.array(exact) - surrogate.joint(z, x))
+    data = np.array([target.data(point) for point in x])
+    exact = weight * data + np.array([np.sum(target.prior_rows(point) ** 2) for point in x])
+    ln_ratio = -0.5 * (exact - surrogate.joint(z, x))
     ln_ratio = ln_ratio - ln_ratio.mean()
     importance = np.exp(np.clip(ln_ratio, -50.0, 50.0))
     t = (x - x.mean(axis=0)) / x.std(axis=0)

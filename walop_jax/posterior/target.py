@@ -2,7 +2,7 @@
 
     −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
 
-A sampler is given either this, in all free parameters (`exact_density`), or the surrogate in the physics coefficients
+A sampler is given either this, in all free parameters (`ExactPosterior`), or the surrogate in the physics coefficients
 alone: throughput series and catalogue values of the standards are near-linear, so that they can be marginalised in
 closed form (`surrogate`) and drawn afterwards.
 """
@@ -26,6 +26,7 @@ from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
+Draws = Float[np.ndarray, "n k"]
 LARGEST_SAMPLED = 20
 LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
 NEAR_LINEAR = ("throughput", "standard")
@@ -36,6 +37,11 @@ def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
     return with_values(template)(values)
 
 
+def ln_f_unit(measured: int) -> float:
+    """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
+    return 1.0 / np.sqrt(2.0 * max(measured, 1))
+
+
 class Target:
     """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
 
@@ -43,12 +49,9 @@ class Target:
         self.likelihood, self._near = result.likelihood, result.expansion
         self.model = result.model
         self.free = result.model.free
-        self.centre: Vector = np.asarray(result.values)[self.free]
-        self.covariance: Float[np.ndarray, "f f"] = np.asarray(result.covariance)[
-            np.ix_(self.free, self.free)
-        ]
-        self.noise_scale = result.noise_scale
-        self._fitted = np.asarray(result.values)
+        self.centre: Vector = result.values[self.free]
+        self.covariance: Float[np.ndarray, "f f"] = result.covariance[np.ix_(self.free, self.free)]
+        self.noise_scale, self._fitted = result.noise_scale, result.values
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,11 +73,6 @@ class Target:
         """Lower triangular L with L Lᵀ the covariance of the fit: x = x̂ + L w has unit covariance in w."""
         scale = self.scale
         return scale[:, None] * np.linalg.cholesky(self.covariance / np.outer(scale, scale))
-
-    @property
-    def ln_f_unit(self) -> float:
-        """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
-        return 1.0 / np.sqrt(2.0 * max(self.measured, 1))
 
     def values(self, x: Vector) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
@@ -119,35 +117,13 @@ class Target:
         return self.data(x) + float(np.sum(self.prior_rows(x) ** 2))
 
 
-def exact_density(target: Target, inflate: bool = False) -> Density:
-    """The exact posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
-
-    With `inflate` the errors of the data are times f; ln f has the prior N(0, 1) and ln f √(2n) is the last coordinate.
-    χ² is that of the forward model: the memory of a gradient is that of one batch of points.
-    """
-    forward = Forward.of(target.likelihood.calset, target.model)
-    first, along = target.values(target.centre), target.model.selection() @ target.root
-    linear = (first, along, target.prior_rows(target.centre), target.prior_slopes(target.root))
-    measured, free = float(target.measured), len(target.free)
-
-    def log_density(
-        w: Array, forward: Forward, first: Array, along: Array, offset: Array, slope: Array
-    ) -> Array:
-        chi2 = forward.chi2(first + along @ w[:free]) / target.noise_scale**2
-        total = jnp.sum((offset + slope @ w[:free]) ** 2)
-        if not inflate:
-            return -0.5 * (chi2 + total)
-        ln_f = w[-1] * target.ln_f_unit
-        return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
-
-    return Density(free + int(inflate), log_density, (forward, *map(jnp.asarray, linear)))
-
-
 @dataclasses.dataclass(frozen=True)
 class ExactPosterior:
-    """Coordinates w with x = x̂ + L w, as in `exact_density`; nothing is marginalised but the fluxes.
+    """The posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
 
-    `sampled` are the positions of the coefficients that figures show; all of them are sampled.
+    Nothing is marginalised but the fluxes. `sampled` are the positions of the coefficients that figures show; all are
+    sampled. With `inflate` the errors of the data are times f; ln f has the prior N(0, 1), and ln f √(2n) is the last
+    coordinate.
     """
 
     target: Target
@@ -155,13 +131,29 @@ class ExactPosterior:
     inflate: bool = False
 
     def density(self) -> Density:
-        """The density of the coordinates."""
-        return exact_density(self.target, self.inflate)
+        """Its density; χ² is that of the forward model: the memory of a gradient is that of one batch of points."""
+        target, inflate, unit = self.target, self.inflate, self.ln_f_unit
+        forward = Forward.of(target.likelihood.calset, target.model)
+        first, along = target.values(target.centre), target.model.selection() @ target.root
+        linear = (first, along, target.prior_rows(target.centre), target.prior_slopes(target.root))
+        measured, free = float(target.measured), len(target.free)
+
+        def log_density(
+            w: Array, forward: Forward, first: Array, along: Array, offset: Array, slope: Array
+        ) -> Array:
+            chi2 = forward.chi2(first + along @ w[:free]) / target.noise_scale**2
+            total = jnp.sum((offset + slope @ w[:free]) ** 2)
+            if not inflate:
+                return -0.5 * (chi2 + total)
+            ln_f = w[-1] * unit
+            return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
+
+        return Density(free + int(inflate), log_density, (forward, *map(jnp.asarray, linear)))
 
     @property
     def ln_f_unit(self) -> float:
         """Change of ln f per unit of its coordinate."""
-        return self.target.ln_f_unit
+        return ln_f_unit(self.target.measured)
 
     @property
     def _order(self) -> Int[np.ndarray, " f"]:
@@ -178,17 +170,14 @@ class ExactPosterior:
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
         """The free parameters (and ln f), in the order of their names."""
         free, k = len(self.target.free), len(self.sampled)
-        x = self.target.centre + z[..., :free] @ self.target.root.T
-        x = x[..., self._order]
+        x = (self.target.centre + z[..., :free] @ self.target.root.T)[..., self._order]
         return np.concatenate([x[..., :k], z[..., free:] * self.ln_f_unit, x[..., k:]], axis=-1)
 
-    def draw(self, z: Float[np.ndarray, "n k"], rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
+    def draw(self, z: Draws, rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
         """Free parameters at sampled coordinates; nothing is left to be drawn."""
         return self.target.centre + z[:, : len(self.target.free)] @ self.target.root.T
 
-    def moments(
-        self, z: Float[np.ndarray, "n k"]
-    ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
+    def moments(self, z: Draws) -> tuple[Vector, Float[np.ndarray, "f f"]]:
         """Mean and covariance of all free parameters over draws."""
         x = self.draw(z, np.random.default_rng(0))
         return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (x.shape[1],))

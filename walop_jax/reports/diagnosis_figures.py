@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LogNorm, Normalize
 from matplotlib.ticker import MaxNLocator
 
@@ -60,9 +59,8 @@ def residual_maps(
     3 σ carry their sign, so that the maps can be read without colours.
     """
     far = max(largest_size(*maps.values()), SIGN_BEYOND)
-    return _maps(
-        points, maps, cameras, Normalize(-far, far), DIVERGING, "residual (σ)", len(points) <= MOST_MARKED, on
-    )
+    norm, signs = Normalize(-far, far), len(points) <= MOST_MARKED
+    return _maps(points, maps, cameras, norm, DIVERGING, "residual (σ)", signs, on)
 
 
 @styled
@@ -117,8 +115,10 @@ def _maps(
                 axis.tick_params(axis="x", labelrotation=90)
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
             tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
-            if signs:
-                _signs(axis, points, values[:, k], norm)
+            for i in np.flatnonzero(signs & (np.abs(np.nan_to_num(values[:, k])) > SIGN_BEYOND)):
+                ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
+                look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
+                axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
     outer_labels(axes)
     for row, title in zip(axes, maps, strict=True):
         for axis in row:
@@ -126,13 +126,6 @@ def _maps(
                 axis.set_ylabel(f"{title}\n\nY (deg)")
     colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
-
-
-def _signs(axis: Axes, points: Points, values: Float[np.ndarray, " p"], norm: Normalize) -> None:
-    for i in np.flatnonzero(np.abs(np.nan_to_num(values)) > SIGN_BEYOND):
-        ink = "white" if abs(norm(values[i]) - 0.5) > 0.35 else "0.25"
-        sign = "+" if values[i] > 0 else "−"
-        axis.text(points.x[i], points.y[i], sign, color=ink, fontsize=5, ha="center", va="center")
 
 
 @styled
@@ -145,16 +138,14 @@ def signature_figure(
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold the remaining
     residuals.
     """
-    angular = _against_angle(comparison, exposures)
+    angular, position, label = _abscissa(comparison, exposures)
     grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
-    position, label = _abscissa(exposures, angular)
     for k, camera in enumerate(cameras):
         finite = np.isfinite(position) & np.isfinite(comparison.curves["BEFORE"][:, k])
         columns = (comparison.curves[name] for name in ("BEFORE", "ERROR", "EXPLAINED", "AFTER"))
-        x, before, error, explained, after = _binned(
-            position[finite], *(column[finite, k] for column in columns)
-        )
+        shown = (column[finite, k] for column in columns)
+        x, before, error, explained, after = _binned(position[finite], *shown)
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
@@ -169,22 +160,16 @@ def signature_figure(
     return figure
 
 
-def _against_angle(comparison: ResidualComparison, exposures: Table) -> bool:
-    behind = np.isfinite(exposures["CLP_ANGLE"])
-    if comparison.harmonic >= 0 or not behind.any():
-        return comparison.harmonic >= 0
+def _abscissa(comparison: ResidualComparison, exposures: Table) -> tuple[bool, Float[np.ndarray, " e"], str]:
+    """True for polariser angles, positions along the axis, its label."""
+    behind, mjd = np.isfinite(exposures["CLP_ANGLE"]), exposures["MJD"]
     explained = comparison.curves["EXPLAINED"]
     power = np.nansum(np.where(explained != 0, explained, comparison.curves["BEFORE"]) ** 2, axis=1)
-    return bool(power[behind].sum() > 0.5 * power.sum())
-
-
-def _abscissa(exposures: Table, angular: bool) -> tuple[Float[np.ndarray, " e"], str]:
-    if angular:
-        return exposures["CLP_ANGLE"], "polariser angle (deg)"
-    mjd = exposures["MJD"]
+    if comparison.harmonic >= 0 or power[behind].sum() > 0.5 * power.sum():
+        return True, exposures["CLP_ANGLE"], "polariser angle (deg)"
     if np.isfinite(mjd).all() and np.ptp(mjd) > 0:
-        return 24.0 * (mjd - mjd.min()), "time since the first exposure (h)"
-    return exposures["EXPOSURE"].astype(float), "exposure"
+        return False, 24.0 * (mjd - mjd.min()), "time since the first exposure (h)"
+    return False, exposures["EXPOSURE"].astype(float), "exposure"
 
 
 def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> list[Float[np.ndarray, " b"]]:
@@ -201,10 +186,7 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
 
 @styled
 def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
-    """χ² per degree of freedom of the starting model and of every model after it, on a logarithmic scale.
-
-    The band is where χ²/dof lies (5 standard deviations) when the model explains the data.
-    """
+    """χ²/dof of the starting model and all after it, logarithmic; in the band (5 σ) a model explains the data."""
     names = [*ladder["MODEL"]]
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
     ratio = ladder["CHI2"] / np.maximum(ladder["DOF"], 1)
@@ -221,9 +203,8 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     margin = (high / low) ** 0.12
     axis.set(xscale="log", xlim=(low / margin, high * margin**2), xlabel="χ² per degree of freedom")
     for y, value in zip(place, ratio, strict=True):
-        axis.annotate(
-            f"{value:.4g}", (value, y), (9, -8), textcoords="offset points", fontsize=8, va="center"
-        )
+        place_of_text = {"xytext": (9, -8), "textcoords": "offset points", "va": "center"}
+        axis.annotate(f"{value:.4g}", (value, y), fontsize=8, **place_of_text)
     axis.set_yticks(place, names)
     axis.set_ylim(len(ratio) - 0.5, -0.5)
     axis.tick_params(labelsize=SMALL)
@@ -273,10 +254,7 @@ _STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 @styled
 def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
-    """Largest error of q and u over the field that a single effect can make without being detected.
-
-    Crosses: q and u cannot both be measured with one exposure there.
-    """
+    """Largest error of q and u by a single effect that goes undetected; crosses: not both in one exposure."""
     from scipy.interpolate import griddata
     from scipy.spatial import KDTree  # takes a tenth of a second, and this figure alone needs it
 
@@ -291,9 +269,8 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
     # Standards lie between the other points: in between the level is interpolated, where one of these is known.
     field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
-    places = np.stack(
-        np.meshgrid(np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)), axis=-1
-    )
+    lines = np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)
+    places = np.stack(np.meshgrid(*lines), axis=-1)
     points = np.stack([found.x, found.y], axis=1)
     level = (
         griddata(points[good], np.log(percent[good]), places)
@@ -312,10 +289,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
-    """Separation (σ) of each effect (column) from each other one (row) that is present at its detection limit.
-
-    Effects that nothing comes near are left out, and counted.
-    """
+    """Separation (σ) of effects (columns) from each one at its detection limit (rows); far ones are counted."""
     alike = found.separation + np.where(np.eye(len(found.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
     confusable = np.flatnonzero((alike | alike.T).any(axis=0))
     confusable = confusable if confusable.size else np.arange(len(found.effects))

@@ -47,16 +47,14 @@ from walop_jax.reports.style import (
 )
 from walop_jax.science.field_accuracy import FieldAccuracy
 
+Parameters = Float[np.ndarray, " n"]  # full vectors
 FITTED = Normalize(0.7, 1.3)
 """Scale of rms residuals of a fit that explains its data, the same for every run."""
 
 
 @styled
 def residuals_figure(
-    likelihood: Likelihood,
-    values: Float[np.ndarray, " n"],
-    before: Float[np.ndarray, " n"],
-    on: Canvas = PAGE,
+    likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
     """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
     figure, (left, middle, right) = on.panels(9.6, 3.0, 1, 3, least=1.6)
@@ -68,18 +66,13 @@ def residuals_figure(
 
 @styled
 def calibration_figure(
-    maps: MatrixMaps,
-    likelihood: Likelihood,
-    values: Float[np.ndarray, " n"],
-    before: Float[np.ndarray, " n"],
-    on: Canvas = PAGE,
+    maps: MatrixMaps, likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
     """A calibration on one page: maps of the matrix, residuals of every field point before and after the fit."""
     rows = max(2, maps.arms)
-    figure, axes = on.panels(10.2, 2.35 * rows, rows, 4, turned=True, sharex=True, sharey=True)
-    matrix_panels(
-        figure, axes[: maps.arms, :3], maps.values, field_of(maps), range(3 * maps.arms), smooth=True
-    )
+    figure, axes = on.panels(10.2, 2.35 * rows, rows, 4, turned=True)
+    elements, shown = range(3 * maps.arms), axes[: maps.arms, :3]
+    matrix_panels(figure, shown, maps.values, field_of(maps), elements, smooth=True)
     _before_and_after(figure, tuple(axes[:2, 3]), likelihood, before, values)
     for axis in (*axes[maps.arms :, :3].ravel(), *axes[2:, 3]):
         axis.remove()
@@ -88,16 +81,9 @@ def calibration_figure(
 
 
 def _before_and_after(
-    figure: Figure,
-    axes: Sequence[Axes],
-    likelihood: Likelihood,
-    before: Float[np.ndarray, " n"],
-    after: Float[np.ndarray, " n"],
+    figure: Figure, axes: Sequence[Axes], likelihood: Likelihood, before: Parameters, after: Parameters
 ) -> None:
-    """Rms residuals of the field points with two vectors of parameters, each on a scale of its own.
-
-    The places of the standards, which lie between the others, are left out.
-    """
+    """Rms residuals of the field points, standards left out, with two vectors of parameters, each on its own scale."""
     points, extended = likelihood.calset.points, likelihood.calset.exposures.kind != "standard"
     shown = np.asarray(likelihood.used[:, extended].any(axis=1), bool)
     shown = shown if shown.any() else np.ones(len(points), bool)
@@ -106,24 +92,20 @@ def _before_and_after(
         low, high = (float(edge(residual[shown])) for edge in (np.nanmin, np.nanmax))
         far = high > 3.0
         field_axes(axis, title)
-        image = point_map(
-            axis, points.x, points.y, residual, Normalize(low, high) if far else FITTED, "magma_r", shown
-        )
+        norm = Normalize(low, high) if far else FITTED
+        image = point_map(axis, points.x, points.y, residual, norm, "magma_r", shown)
         colour_bar(figure, image, axis, "rms residual (σ)", extend="neither" if far else "both")
 
 
-def point_residuals(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
-    """Rms normalised residual of each field point; 1 is what noise alone gives (the flux took one in four).
-
-    NaN where a point has no data.
-    """
+def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndarray, " p"]:
+    """Rms normalised residual of each field point, 1 by noise alone (the flux took one in four); NaN without data."""
     _, residual = likelihood.residuals(values)
     freedom = (likelihood.used * likelihood.data_per_row).sum(axis=1)
     square = (residual**2).sum(axis=(1, 2))
     return np.sqrt(np.where(freedom > 0, square / np.maximum(freedom, 1.0), np.nan))
 
 
-def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
+def _histogram(axis: Axes, likelihood: Likelihood, values: Parameters) -> None:
     """All residuals of a fit, and what noise alone would give."""
     _, residual = likelihood.residuals(values)
     # A flux takes the share y²/Σy² of the variance of every intensity y, in units of its error.
@@ -134,9 +116,8 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Float[np.ndarray, " n
     width = np.sqrt(np.clip(1.0 - flux_share, 1e-3, None))[likelihood.used].ravel()
     used = residual[likelihood.used].ravel()
     edges = np.linspace(-4.0, 4.0, 41)
-    density = np.full(
-        used.size, 1.0 / (used.size * (edges[1] - edges[0]))
-    )  # those beyond the axis count as well
+    # Those beyond the axis count as well.
+    density = np.full(used.size, 1.0 / (used.size * (edges[1] - edges[0])))
     axis.hist(used / width, bins=edges.tolist(), weights=density, color="0.75", label="residuals")
     beyond = float(np.mean(np.abs(used / width) > edges[-1]))
     if beyond > 0:
@@ -177,9 +158,8 @@ def modulation_figure(
             rows = shown[block.used[point, shown]]
             first, second = block.counts[point, rows, pair], block.counts[point, rows, pair + 1]
             where = with_minus_sign(f"X {block.x[point]:+.2f}°, Y {block.y[point]:+.2f}°")
-            axis.plot(
-                e.clp_angle[rows], (first - second) / (first + second), "os^Dv"[k % 5], ms=4, label=where
-            )
+            signal = (first - second) / (first + second)
+            axis.plot(e.clp_angle[rows], signal, "os^Dv"[k % 5], ms=4, label=where)
         axis.set(xlabel="polariser angle (deg)", ylabel=name)
         angle_ticks(axis.xaxis, figure, arms)
     figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc=ABOVE)
@@ -188,35 +168,27 @@ def modulation_figure(
 
 @styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
-    """The elements of the instrument matrix over the field as `matrix_panels` draws them.
-
-    `kind`: only those that Paper II calls by one name (`PAPER_NAMES`): zero offsets, efficiencies or cross-talk.
-    """
+    """The elements of the matrix over the field; `kind`: those of one name in Paper II (place in `PAPER_NAMES`)."""
     chosen = [i for i in range(len(maps.values)) if kind in (None, element_kind(i, maps.arms))]
     rows = maps.arms if kind is None else 1
     columns = max(len(chosen) // rows, 1)
     size = ((2.9 if rows > 1 else 4.0) * columns, 2.65 * rows + 0.7 * (rows == 1))
-    figure, axes = on.panels(*size, rows, columns, turned=True, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(*size, rows, columns, turned=True, squeeze=False)
     matrix_panels(figure, axes, maps.values, field_of(maps), chosen)
     return figure
 
 
 @styled
 def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """The standard errors of the elements of the instrument matrix over the field, in per cent, one logarithmic scale.
-
-    It ends at whole decades, so that the errors of different runs can be compared.
-    """
-    figure, axes = on.panels(
-        8.6, 2.3 * maps.arms, maps.arms, 3, turned=True, sharex=True, sharey=True, squeeze=False
-    )
+    """The standard errors of the elements of the matrix over the field (%), on a logarithmic scale of whole decades."""
+    figure, axes = on.panels(8.6, 2.3 * maps.arms, maps.arms, 3, turned=True, squeeze=False)
     low, high = (100.0 * float(edge(maps.errors[maps.errors > 0], initial=1e-6)) for edge in (np.min, np.max))
     high = 10.0 ** np.ceil(np.log10(high))
     low = max(10.0 ** np.floor(np.log10(low)), high / 1e4)
     image = None
     for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(maps.arms), strict=True):
         least, highest = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
-        field_axes(axis, f"error of {name}\n{least} to {highest} %")
+        field_axes(axis, f"error of {name}\n{least}–{highest} %")
         image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
     colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
     outer_labels(axes)
@@ -225,17 +197,12 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """By how much the elements of the instrument matrix have changed over the field, in per cent.
-
-    Those that Paper II calls by one name share a scale. Raises ValueError for maps of different places.
-    """
+    """Change of the matrix over the field (%), a scale for each name of Paper II; ValueError for other places."""
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
     kinds = [element_kind(i, new.arms) for i in range(len(change))]
-    figure, axes = on.panels(
-        8.6, 2.3 * new.arms, new.arms, 3, turned=True, sharex=True, sharey=True, squeeze=False
-    )
+    figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, turned=True, squeeze=False)
     for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
         far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
         field_axes(axis, f"change of {name}")
@@ -254,7 +221,7 @@ def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canv
     """
     arms = (len(residuals.values) + 1) // 4
     elements, ratios = residuals.values[: 3 * arms], residuals.values[3 * arms :]
-    figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, turned=True, sharex=True, sharey=True, squeeze=False)
+    figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, turned=True, squeeze=False)
 
     def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
         field_axes(axis, title)
@@ -297,9 +264,8 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     low, high = float(percent.min()), float(percent.max())
     field_axes(left, f"error of p (%), {accuracy.filter}")
     norm = LogNorm(0.003, _RANGE[1])
-    colour_bar(
-        figure, pixel_map(left, percent, accuracy.extent, norm, SEQUENTIAL, smooth=True), left, extend="both"
-    )
+    image = pixel_map(left, percent, accuracy.extent, norm, SEQUENTIAL, smooth=True)
+    colour_bar(figure, image, left, extend="both")
     if low < goal < high:
         fine = 10.0 ** zoom(np.log10(percent), 4, order=1)
         left.contour(fine, [goal], extent=accuracy.extent, colors="w", linewidths=1.2)

@@ -78,9 +78,8 @@ def _corner(source: FigureSource) -> AnyFigure:
         size["width"] = source.canvas.figsize[0]
     if source.canvas.width is not None:
         size["width"] = source.canvas.width
-    return posterior_figures.corner_figure(
-        draws, shown, [units[name] for name in shown], source.reference, **size
-    )
+    texts = [units[name] for name in shown]
+    return posterior_figures.corner_figure(draws, shown, texts, source.reference, **size)
 
 
 def _trace(source: FigureSource) -> AnyFigure:
@@ -91,9 +90,8 @@ def _trace(source: FigureSource) -> AnyFigure:
     if sample is not None and set(shown) <= set(sample.sampled):  # the walkers, not the draws
         column = [sample.sampled.index(name) for name in shown]
         chains, steps, tau = sample.chains[..., column], sample.thin, sample.convergence.tau[column]
-    return posterior_figures.trace_figure(
-        chains, shown, [units[name] for name in shown], steps, tau, source.canvas
-    )
+    texts = [units[name] for name in shown]
+    return posterior_figures.trace_figure(chains, shown, texts, steps, tau, source.canvas)
 
 
 def _cameras(source: FigureSource) -> tuple[str, ...] | None:
@@ -126,9 +124,8 @@ class NamedFigure:
 def _small(source: FigureSource) -> bool:
     """True where the run names its data, a set of points: a survey does not, whole frames have a map of residuals."""
     run = source.run
-    return source.stored.residuals is None and (
-        run is None or bool(run.data or (run.product and run.product.inputs))
-    )
+    named = run is None or bool(run.data or (run.product and run.product.inputs))
+    return source.stored.residuals is None and named
 
 
 def _plates(source: FigureSource) -> list[str]:
@@ -278,9 +275,8 @@ OF_RESULTS: Mapping[str, NamedFigure] = {
 def possible(source: FigureSource) -> dict[str, NamedFigure]:
     """The figures that a run, or a result in memory, can give; its plates go by their names."""
     known = FIGURES if source.run is not None else {**FIGURES, **OF_RESULTS}
-    figures = {
-        name: entry for name, entry in known.items() if entry.needs in source and entry.possible(source)
-    }
+    in_source = {name: entry for name, entry in known.items() if entry.needs in source}
+    figures = {name: entry for name, entry in in_source.items() if entry.possible(source)}
     if "retardance" in figures:
         about = f"maps of the retardance of {listed(_plates(source))}"
         figures["retardance"] = dataclasses.replace(figures["retardance"], about=about)
@@ -294,7 +290,6 @@ def draw(name: str, source: FigureSource) -> AnyFigure:
             raise ValueError(f"the figure {name!r} has a size of its own: leave ax, figsize and width out")
         return OF_RESULTS[name].draw(source)
     if name not in FIGURES:
-        raise fail(
-            f"there is no figure {name!r}", advice=f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"
-        )
+        advice = f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"
+        raise fail(f"there is no figure {name!r}", advice=advice)
     return FIGURES[name].draw(source)

@@ -10,15 +10,14 @@ import dataclasses
 import functools
 import io
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.product import read_product
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
@@ -32,12 +31,11 @@ from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import FigureSource, RunContents, read_limits
-from walop_jax.reports.style import PAGE, WIDTHS, Canvas
+from walop_jax.reports.style import PAGE, TEMPLATES, WIDTHS, Canvas, texts
 from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
 from walop_jax.science.commissioning import is_go, requirement_advice, requirement_rows, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
-TEMPLATES = Path(__file__).parent / "templates"
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 MANY = 32  # rows of a table above which it is folded
@@ -107,12 +105,6 @@ def filled(head: Display, sections: Iterable[Section], *, good: bool, **content:
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
 
 
-@functools.cache
-def captions() -> Mapping[str, str]:
-    """Captions of figures by name, and of pictures by file."""
-    return tomllib.loads((TEMPLATES / "captions.toml").read_text(encoding="utf-8"))
-
-
 def embedded(content: bytes, kind: str = "png") -> str:
     """A picture as a data URI: for an image inside a page."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
@@ -125,7 +117,7 @@ def picture(name: str, drawn_on: Callable[[Canvas], Any], **words: str) -> Pictu
         stream = io.BytesIO()
         drawn_on(canvas).savefig(stream, format="svg", metadata={"Date": None})
         images.append(embedded(stream.getvalue(), "svg+xml"))
-    return Picture(images[0], captions()[name].format(**words), name in SMALL, images[1])
+    return Picture(images[0], texts("captions")[name].format(**words), name in SMALL, images[1])
 
 
 def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **words: str) -> list[Picture]:
@@ -162,6 +154,8 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         head = head if accuracy is None else _with_goal(head, accuracy)
     missing = [*run.missing]
     error_maps = _accuracy_pictures(run, missing) if trusted else ()
+    limits = [] if run.limits is None else [run.limits.display()]
+    limits = [dataclasses.replace(d, title=f"{d.title}: {len(d.rows)} amplitudes") for d in limits]
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
@@ -173,7 +167,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         *([] if diagnosis is None else _diagnosed(run, head, missing)),
         Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
         *([] if diagnosis is None else [_candidates(run)]),
-        Section("limits", "What these data can show", folded=_limits(run)),
+        Section("limits", "What these data can show", folded=limits),
         Section("warnings", "Warnings", Display("", notes=_warnings(run) or ("None.",))),
         Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run, missing)),
         Section("pulls", "Largest pulls from the priors", _pulls(run)),
@@ -226,12 +220,9 @@ def _with_goal(head: Display, known: FieldAccuracy) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
     answer = known.facts()
     replaced = {name for name, _ in answer}
-    remaining = [
-        fact
-        for fact in head.facts
-        if fact[0] not in replaced and not fact[0].startswith(("good for", "what to do"))
-    ]
-    return dataclasses.replace(head, facts=(*answer, *remaining))
+    unchanged = [fact for fact in head.facts if not fact[0].startswith(("good for", "what to do"))]
+    unchanged = [fact for fact in unchanged if fact[0] not in replaced]
+    return dataclasses.replace(head, facts=(*answer, *unchanged))
 
 
 def _accuracy_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
@@ -255,13 +246,9 @@ def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
     if several:
         names = ["ladder", "rms", "shares"] if len(data.comparisons) > 2 else ["ladder", "shares"]
         return drawn(run.source, names, missing)
-    whole = picture(
-        "whole",
-        lambda canvas: diagnosis_figures.residual_maps(
-            data.points, {"residuals": overall.field["BEFORE"]}, data.cameras, canvas
-        ),
-        combination=in_greek(overall.combination),
-    )
+    residuals = data.points, {"residuals": overall.field["BEFORE"]}, data.cameras
+    draw_whole = functools.partial(diagnosis_figures.residual_maps, *residuals)
+    whole = picture("whole", draw_whole, combination=in_greek(overall.combination))
     return [whole, *drawn(run.source, ["shares"], missing)]
 
 
@@ -299,47 +286,27 @@ def _candidates(run: RunContents) -> Section:
     """Every effect of the catalogue at the first look, limits on effects that were not found."""
     assert run.diagnosis is not None
     catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
-    rows = tuple(
-        (
-            row["effect"],
-            effect_in_words(row["effect"], catalogue),
-            rounded(row["score"], ".6g"),
-            probability(row["p_value"]).removeprefix("= "),
-        )
-        for row in run.diagnosis["candidates"]
-    )
+    rows = ()
+    for row in run.diagnosis["candidates"]:
+        effect, chance = row["effect"], probability(row["p_value"]).removeprefix("= ")
+        rows += ((effect, effect_in_words(effect, catalogue), rounded(row["score"], ".6g"), chance),)
     table = Display("", head=("effect", "meaning", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
     hidden_rows = rows[SHOWN_CANDIDATES:]
-    limits = tuple(
-        (
-            row["effect"],
-            row["parameter"],
-            *value_and_error(row["value"], row["sigma"]),
-            rounded(row["below_95"], ".2g"),
-            row["unit"],
-        )
-        for row in run.diagnosis.get("limits", ())
+    limits = ()
+    for row in run.diagnosis.get("limits", ()):
+        texts = value_and_error(row["value"], row["sigma"])
+        limits += ((row["effect"], row["parameter"], *texts, rounded(row["below_95"], ".2g"), row["unit"]),)
+    title = (
+        f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability"
     )
+    head = ("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit")
     folded = (
         Display(f"{len(hidden_rows)} more", head=table.head, rows=hidden_rows),
-        Display(
-            f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability",
-            head=("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit"),
-            rows=limits,
-        ),
+        Display(title, head=head, rows=limits),
     )
     text = "Every effect of the catalogue at the first look at the starting model; p is corrected for their number."
-    return Section(
-        "candidates", "Candidates", table, folded=[display for display in folded if display.rows], text=text
-    )
-
-
-def _limits(run: RunContents) -> list[Display]:
-    """The detection limits of the data of the fit, behind a line."""
-    if run.limits is None:
-        return []
-    shown = run.limits.display()
-    return [dataclasses.replace(shown, title=f"{shown.title}: {len(shown.rows)} amplitudes")]
+    folded = [display for display in folded if display.rows]
+    return Section("candidates", "Candidates", table, folded=folded, text=text)
 
 
 def _doubts(summary: Mapping[str, Any]) -> list[str]:
@@ -377,7 +344,7 @@ def _posterior(run: RunContents) -> Section:
     """The verdict on the chains, intervals, and the corner plot."""
     shown = None if run.sample is None else display_of(run.sample, run.source.folder / "sample.json")
     names = [] if shown is None else [row[0] for row in shown.rows]
-    words = captions()["corner"] + symbols_in_words(names)
+    words = texts("captions")["corner"] + symbols_in_words(names)
     pictures = [] if run.corner is None else [Picture(embedded(run.corner), words)]
     return Section("posterior", "Posterior", shown, pictures)
 
@@ -425,24 +392,11 @@ def in_greek(text: str) -> str:
 # -------------------------------------------------------------------------------------------------- other results
 
 
-OTHERS = {
-    "comparison": ("Paper II and the joint model", "trusted"),
-    "epoch": ("An old calibration and new data", "fits"),
-    "plan": ("Which calibration exposures to take", ""),
-    "limits": ("What these data can show", ""),
-    "survey": ("Many nights of one instrument", "trusted"),
-    "watch": ("Is the calibration still valid?", "holds"),
-    "affected": ("Catalogues that a new calibration changes", ""),
-    "commissioning": ("Go or no-go", "go"),
-}
-"""Pages about no fit by the name of their document (`io.names.DOCUMENTS`): title, key that says if it is good."""
-
-
 def kind_of_run(folder: Path) -> str:
-    """One of `OTHERS` for a folder that holds such a document and no fit to report; else `fit`."""
+    """One of the pages about no fit for a folder that holds such a document and no fit to report; else `fit`."""
     if (folder / SUMMARY).exists():
         return "fit"
-    return next((kind for kind in OTHERS if (folder / DOCUMENTS[kind]).exists()), "fit")
+    return next((kind for kind in texts("pages") if (folder / DOCUMENTS[kind]).exists()), "fit")
 
 
 def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
@@ -450,13 +404,13 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
 
     Raises `DataError` for a document that cannot be read or lacks contents of the page.
     """
-    (title, key), missing = OTHERS[kind], []
+    page, missing = texts("pages")[kind], []
     document = RunFolder(folder).document(DOCUMENTS[kind], ("shown",))
     head = display_of(document, folder / DOCUMENTS[kind])
     pictures = _pictures(folder, kind, document, missing)
     limited = kind == "plan" and (folder / LIMITS).exists()
     limits = read_limits(folder / LIMITS).display() if limited else None
-    good = bool(document.get(key, True)) and bool(document.get("new_trusted", True))
+    good = bool(document.get(page.get("trust"), True)) and bool(document.get("new_trusted", True))
     text = filled(
         head,
         (
@@ -466,24 +420,15 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
         ),
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),
-        title=title,
+        title=page["title"],
         about="",
         first="",
         doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
         name=folder.resolve().name,
-        next=_AFTER.get(kind, ()),
+        next=page.get("next", ()),
         missing=missing,
     )
     return text, tuple(missing)
-
-
-_AFTER: Mapping[str, Sequence[tuple[str, str]]] = {
-    "limits": [("plan exposures that show more", "walop-jax plan RUN --minutes 10")],
-    "plan": [("rehearse it", "walop-jax simulate PLAN/plan.toml -o SET.fits")],
-    "epoch": [("fit all nights together", "walop-jax stack RUN NEW.fits -o SURVEY")],
-    "survey": [("correct stars", "walop-jax apply SURVEY STARS.fits -o OUT.fits")],
-}
-"""Next steps after what other commands have made: words and a command line."""
 
 
 def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:
@@ -509,7 +454,9 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
-    names = {name: words for name, words in captions().items() if re.fullmatch(rf"{kind}.*\.png", name)}
+    names = {
+        name: words for name, words in texts("captions").items() if re.fullmatch(rf"{kind}.*\.png", name)
+    }
     missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
     return [  # panels of watch are below each other: whole on a narrow screen
         Picture(embedded((folder / name).read_bytes()), words, small=kind == "watch")

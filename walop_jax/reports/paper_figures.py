@@ -9,9 +9,9 @@ from jaxtyping import Float
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
@@ -43,6 +43,7 @@ from walop_jax.reports.style import (
 )
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
+Places = Float[np.ndarray, " p"]
 _PIXELS, _LINES = 31, 41
 _STEPS = 21  # from the centre of the field to its edge
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
@@ -58,9 +59,8 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
     for name, axis, values in zip(names, axes[0], retardances, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
-        smooth = np.unwrap(
-            np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0), axis=0, period=360.0
-        )
+        along = np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0)
+        smooth = np.unwrap(along, axis=0, period=360.0)
         smooth -= 360.0 * np.floor(smooth[_PIXELS // 2, _PIXELS // 2] / 360.0)
         field_axes(axis, f"{PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
         norm = Normalize(float(smooth.min()), float(smooth.max()))
@@ -103,10 +103,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
 
 
 def _unwrapped_retardances(
-    instrument: Instrument,
-    line: Float[np.ndarray, " w"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
+    instrument: Instrument, line: Float[np.ndarray, " w"], x: Places, y: Places
 ) -> Float[np.ndarray, "n p w"]:
     """Retardances (deg) of plates at places and wavelengths (µm), without jumps of 360°.
 
@@ -130,7 +127,7 @@ def _unwrapped_retardances(
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
     fits = fit_paper(calset, filter_name)
-    figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True, sharex=True, sharey=True)
+    figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
@@ -145,7 +142,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
     return figure
 
 
-def _most(values: Float[np.ndarray, " p"]) -> tuple[float, float]:
+def _most(values: Places) -> tuple[float, float]:
     """The range of the values without those more than five (robust) standard deviations from their median."""
     median = float(np.median(values))
     spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0
@@ -167,9 +164,8 @@ def transmission_figure(
     e = calset.exposures
     rows = np.flatnonzero(e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == filter_name))
     if len(np.unique(np.mod(e.clp_angle[rows], 180.0))) < 3:
-        raise DataError(
-            f"EXPOSURES: fewer than 3 polariser angles in {filter_name}: nothing to draw a curve through"
-        )
+        what = f"EXPOSURES: fewer than 3 polariser angles in {filter_name}"
+        raise DataError(f"{what}: nothing to draw a curve through")
     block = calset.intensities.block(0, len(calset.points))
     complete = np.flatnonzero(block.used[:, rows].all(axis=1))
     point = complete[np.argmin(np.hypot(block.x[complete] - place[0], block.y[complete] - place[1]))]

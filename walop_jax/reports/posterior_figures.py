@@ -15,37 +15,17 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.text import RAISED, with_error
-from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure, styled
+from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure, styled, texts
 
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
 MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
 PRIOR_ONLY = 0.9  # of the prior width: a wider posterior is a picture of the prior
-LABELS = {
-    "sky.depolarisation": "$\\delta$",
-    "collimator.diattenuation": "$c$",
-    "collimator.q": "$c_q$",
-    "collimator.u": "$c_u$",
-    "pupil.magnification": "$M$",
-    "pupil.distortion": "$\\kappa$",
-    "half1.wedge": "$w_1$",
-    "half2.wedge": "$w_2$",
-    "half1.plate.quartz": "$d_{q,1}$",
-    "half1.plate.mgf2": "$d_{m,1}$",
-    "half2.plate.quartz": "$d_{q,2}$",
-    "half2.plate.mgf2": "$d_{m,2}$",
-    "chwp.quartz": "$d_{q,c}$",
-    "chwp.mgf2": "$d_{m,c}$",
-    "half1.efficiency": "$\\eta_1$",
-    "half2.efficiency": "$\\eta_2$",
-    "noise.ln_f": "$\\ln f$",
-}
-"""Symbols of the coefficients that people quote; others keep their name."""
 
 
 def label(name: str, unit: str = "") -> str:
     """Symbol of a coefficient, with its unit."""
-    text = LABELS.get(name, name)
+    text, _ = texts("symbols").get(name, (name, name))
     return f"{text} ({unit_in_words(unit)})" if unit else text
 
 
@@ -58,13 +38,9 @@ def unit_in_words(unit: str) -> str:
 def informed(
     names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """The names constrained by the data, best first: posterior narrower than the prior, where there is one.
-
-    `spread` holds standard deviations of the posterior, `prior` those of the prior (NaN: none).
-    """
-    share = {
-        name: spread[name] / prior[name] if np.isfinite(prior.get(name, np.nan)) else 0.0 for name in names
-    }
+    """Names that the data constrain, best first: `spread` (posterior) below that of the `prior` (NaN: none)."""
+    with_prior = {name for name in names if np.isfinite(prior.get(name, np.nan))}
+    share = {name: spread[name] / prior[name] if name in with_prior else 0.0 for name in names}
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
 
 

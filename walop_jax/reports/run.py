@@ -11,26 +11,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, read_figure_data
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.fit.refit import FitResult
+from walop_jax.io import names
 from walop_jax.io.errors import DataError, fail
-from walop_jax.io.names import (
-    COMMISSIONING,
-    CORNER,
-    DIAGNOSIS,
-    FIGURE_DATA,
-    LIMITS,
-    POSTERIOR,
-    PRODUCT,
-    SAMPLE,
-    SUMMARY,
-)
 from walop_jax.io.run_folder import OF_A_FIT, RunFolder
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.free_form import FreeForm
@@ -79,18 +69,18 @@ class FigureSource:
         if isinstance(given, Run):
             return cls(given, **options)
         if isinstance(given, PosteriorSample):
-            return cls(held={POSTERIOR: given.groups()}, sample=given, **options)
+            return cls(held={names.POSTERIOR: given.groups()}, sample=given, **options)
         if isinstance(given, Calibration | Comparison | Survey | CalibrationSet):
-            names = {Calibration: PRODUCT, Comparison: COMPARISON, Survey: SURVEY, CalibrationSet: DATA}
-            return cls(held={names[type(given)]: given}, **options)
+            keys = {Calibration: names.PRODUCT, Comparison: COMPARISON, Survey: SURVEY, CalibrationSet: DATA}
+            return cls(held={keys[type(given)]: given}, **options)
         result = given.after if isinstance(given, Diagnosis) else given
         product = Calibration.from_fit(result)
         data = result.likelihood
         if product.model is not result.model:  # that of a mean over a class has its members as well
             data = Likelihood.of(result.calset, product.model)
-        held = {DATA: data, PRODUCT: product}
+        held = {DATA: data, names.PRODUCT: product}
         if isinstance(given, Diagnosis):
-            held |= {FIGURE_DATA: figure_data(given)}
+            held |= {names.FIGURE_DATA: figure_data(given)}
         return cls(held=held, **options)
 
     def on(self, canvas: Canvas) -> FigureSource:
@@ -117,19 +107,19 @@ class FigureSource:
     @property
     def product(self) -> Calibration | Product | None:
         """Contents of the file of the calibration, or the calibration in memory; None without either."""
-        return self.held.get(PRODUCT) if self.run is None else self.run.product
+        return self.held.get(names.PRODUCT) if self.run is None else self.run.product
 
     @property
     def stored(self) -> Calibration | Product:
         """The same; `DataError` without one."""
         if self.run is not None:
-            self.run.wanted(PRODUCT)
-        return self._wanted(PRODUCT, lambda run: run.product)  # pyright: ignore[reportReturnType]
+            self.run.wanted(names.PRODUCT)
+        return self._wanted(names.PRODUCT, lambda run: run.product)  # pyright: ignore[reportReturnType]
 
     @property
     def rebuilt(self) -> Calibration:
         """The calibration with its model."""
-        return self._wanted(PRODUCT, lambda run: run.rebuilt)
+        return self._wanted(names.PRODUCT, lambda run: run.rebuilt)
 
     @property
     def maps(self) -> MatrixMaps:
@@ -139,7 +129,7 @@ class FigureSource:
     @property
     def posterior(self) -> Any:
         """The draws, in the groups of ArviZ; None without any."""
-        return self.held.get(POSTERIOR) if self.run is None else self.run.posterior
+        return self.held.get(names.POSTERIOR) if self.run is None else self.run.posterior
 
     @property
     def prior_width(self) -> Mapping[str, float]:
@@ -165,9 +155,9 @@ class FigureSource:
     @functools.cached_property
     def figure_data(self) -> DiagnosisFigureData:
         """Data of the figures of a diagnosis."""
-        advice = "it comes with walop-jax diagnose"
+        hint = "it comes with walop-jax diagnose"
         return self._wanted(
-            FIGURE_DATA, lambda run: read_figure_data(run.wanted(FIGURE_DATA, advice)), advice
+            names.FIGURE_DATA, lambda run: read_figure_data(run.wanted(names.FIGURE_DATA, hint)), hint
         )
 
     @functools.cached_property
@@ -179,7 +169,7 @@ class FigureSource:
     def limits(self) -> DetectionLimits:
         """The detection limits of the data."""
         advice = "run walop-jax limits -o RUN first"
-        return self._wanted(LIMITS, lambda run: read_limits(run.wanted(LIMITS, advice)), advice)
+        return self._wanted(names.LIMITS, lambda run: read_limits(run.wanted(names.LIMITS, advice)), advice)
 
     @property
     def examined(self) -> int:
@@ -187,9 +177,8 @@ class FigureSource:
         count = len(self.figure_data.comparisons) - 1
         if self.step > count:
             result = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
-            raise fail(
-                f"step {self.step}: {result}", advice="step 0 compares the starting with the final model"
-            )
+            advice = "step 0 compares the starting with the final model"
+            raise fail(f"step {self.step}: {result}", advice=advice)
         return self.step
 
 
@@ -221,7 +210,7 @@ def read_run(run: Run | Path) -> RunContents:
     files that are absent or damaged are left out and listed in `missing`.
     """
     run = Run(run) if isinstance(run, Path) else run
-    run.wanted(SUMMARY)
+    run.wanted(names.SUMMARY)
     source = FigureSource(run)
     missing: list[str] = []
 
@@ -236,32 +225,33 @@ def read_run(run: Run | Path) -> RunContents:
             missing.append(f"{name} cannot be used ({error}): {lost}.")
             return None
 
-    summary = DEFAULTS | run.document(SUMMARY, SUMMARY_KEYS)
-    product = optional(PRODUCT, lambda: run.product, "no maps of the matrix, no pulls from the priors")
-    diagnosis = run.document(DIAGNOSIS, DIAGNOSIS_KEYS) if DIAGNOSIS in run else None
+    summary = DEFAULTS | run.document(names.SUMMARY, SUMMARY_KEYS)
+    product = optional(names.PRODUCT, lambda: run.product, "no maps of the matrix, no pulls from the priors")
+    diagnosis = run.document(names.DIAGNOSIS, DIAGNOSIS_KEYS) if names.DIAGNOSIS in run else None
     pictures = None
     if diagnosis is not None:
         lost = "no maps of the residuals, no curves, no ladder of χ²"
-        pictures = optional(FIGURE_DATA, lambda: source.figure_data, lost)
-        names = [step["effect"] for step in diagnosis["steps"]]
+        pictures = optional(names.FIGURE_DATA, lambda: source.figure_data, lost)
+        effects = [step["effect"] for step in diagnosis["steps"]]
         drawn = [] if pictures is None else [comparison.effect for comparison in pictures.comparisons[1:]]
-        if pictures is not None and drawn not in (names, [*names, FreeForm.name]):
-            missing.append(
-                f"{FIGURE_DATA} is of another diagnosis than {DIAGNOSIS}: its pictures are left out."
-            )
+        if pictures is not None and drawn not in (effects, [*effects, FreeForm.name]):
+            what = f"is of another diagnosis than {names.DIAGNOSIS}: its pictures are left out"
+            missing.append(f"{names.FIGURE_DATA} {what}.")
             pictures = None
-        if _another_fit(summary, diagnosis):
-            missing.append(
-                f"{DIAGNOSIS} is of another fit than {SUMMARY}: this folder was written to again since."
-            )
-    sampled = POSTERIOR in run
+        stated, ratio = diagnosis.get("chi2_per_dof_after"), summary["chi2"] / max(summary["dof"], 1)
+        if stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio:
+            what = f"is of another fit than {names.SUMMARY}: this folder was written to again since"
+            missing.append(f"{names.DIAGNOSIS} {what}.")
+    sampled = names.POSTERIOR in run
     extras = {
-        "sample": optional(SAMPLE, lambda: run.document(SAMPLE), "no verdict on the sampling", sampled),
-        "corner": optional(CORNER, (run.folder / CORNER).read_bytes, "no corner plot", sampled),
-        "limits": optional(LIMITS, lambda: _limits(run, summary), "no protection level", False),
+        "sample": optional(
+            names.SAMPLE, lambda: run.document(names.SAMPLE), "no verdict on the sampling", sampled
+        ),
+        "corner": optional(names.CORNER, (run.folder / names.CORNER).read_bytes, "no corner plot", sampled),
+        "limits": optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False),
         "commissioning": optional(
-            COMMISSIONING,
-            lambda: run.document(COMMISSIONING, ("go", "requirements")),
+            names.COMMISSIONING,
+            lambda: run.document(names.COMMISSIONING, ("go", "requirements")),
             "no go or no-go",
             False,
         ),
@@ -280,22 +270,15 @@ def read_limits(path: Path) -> DetectionLimits:
         content = RunFolder(path.parent).document(path.name, ("limits", "effects", "protection"))
         return DetectionLimits.from_document(content)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise fail(
-            f"is not what walop-jax limits writes: {error}", file=path, advice="run it again"
-        ) from error
+        what = f"is not what walop-jax limits writes: {error}"
+        raise fail(what, file=path, advice="run it again") from error
 
 
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:
     """The limits of the data behind a summary; those of other data are refused."""
-    documents = run.document(LIMITS, ("inputs",)), summary
+    documents = run.document(names.LIMITS, ("inputs",)), summary
     of, expected = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
-    path = run.folder / LIMITS
+    path = run.folder / names.LIMITS
     if of != expected:
         raise fail("is of other data", file=path, advice="run walop-jax limits on the sets of this run")
     return read_limits(path)
-
-
-def _another_fit(summary: dict[str, Any], diagnosis: dict[str, Any]) -> bool:
-    stated = diagnosis.get("chi2_per_dof_after")
-    ratio = summary["chi2"] / max(summary["dof"], 1)
-    return stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio

@@ -6,7 +6,9 @@ import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import matplotlib.style
@@ -23,10 +25,11 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarFormatter
 
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
 from walop_jax.sky.nights import FIRST_DATE
 
+TEMPLATES = Path(__file__).parent / "templates"
 FONT = 9
 SMALL = 7
 NARROW = 4.5  # inches: a column of print, or half a page
@@ -54,9 +57,16 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
+Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
 AnyFigure = Any
 """A figure on a `Canvas`, or the subfigure that took the room of axes."""
+
+
+@functools.cache
+def texts(name: str) -> Mapping[str, Any]:
+    """Texts beside the templates: `captions`, `symbols` of coefficients (mathematics, text), `pages` about no fit."""
+    return tomllib.loads((TEMPLATES / f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def own_style() -> contextlib.AbstractContextManager[None]:
@@ -65,10 +75,7 @@ def own_style() -> contextlib.AbstractContextManager[None]:
 
 
 class PaperFigure(Figure):
-    """A figure that is drawn in the style of the package, and written with TrueType fonts (PDF, PostScript).
-
-    Journals refuse Type 3, matplotlib's default.
-    """
+    """A figure in the style of the package, with TrueType fonts: journals refuse Type 3, matplotlib's default."""
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as any other."""
@@ -125,9 +132,10 @@ class Canvas:
         """A figure, and panels in it with small numbers, as `subplots` makes them.
 
         `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of the labels
-        around each at any size; where columns are narrower, rows become
-        columns (`turned`), or groups of columns go below each other.
+        around each at any size; where columns are narrower, rows become columns (`turned`: of maps, which share their
+        axes), or groups of columns go below each other.
         """
+        options |= {"sharex": True, "sharey": True} if turned else {}
         turned = turned and self._narrow(columns, least) and rows < columns
         group = columns
         if turned:
@@ -155,9 +163,8 @@ class Canvas:
             empty.remove()
         if groups * group > columns:  # the last panel takes the rest of its row
             place = axes[0, columns - 1].get_subplotspec()
-            axes[0, columns - 1].set_subplotspec(
-                place.get_gridspec()[place.rowspan.start, place.colspan.start :]
-            )
+            rest = place.get_gridspec()[place.rowspan.start, place.colspan.start :]
+            axes[0, columns - 1].set_subplotspec(rest)
         axes = axes[:, :columns]
         axes = axes.T if turned else axes
         for axis in np.ravel(axes):
@@ -207,6 +214,7 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
 def field_axes(axis: Axes, title: str = "") -> None:
     """Make axes a map of the field."""
     axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
+    axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     axis.tick_params(labelsize=SMALL)
 
 
@@ -246,17 +254,14 @@ def pixel_map(
 
 def point_map(
     axis: Axes,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-    values: Float[np.ndarray, " p"],
+    x: Places,
+    y: Places,
+    values: Places,
     norm: Normalize,
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
 ) -> Any:
-    """A square tile for each field point, as wide as the distance to its neighbours; none where there is no value.
-
-    `shown` are the points that set the distance and the edges of the map (default: all).
-    """
+    """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges."""
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
     visible = shown & np.isfinite(values)
@@ -273,7 +278,7 @@ def point_map(
     return tiles
 
 
-def _spacing(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> float:
+def _spacing(x: Places, y: Places) -> float:
     """Side of the tiles: the typical distance to the nearest neighbour."""
     few = slice(0, MOST_VECTOR)
     distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])
@@ -313,9 +318,8 @@ def angle_ticks(axis: Axis, figure: Any, columns: int) -> None:
 def calendar(axis: Axes, mjd: Any) -> bool:
     """Write dates (UTC), a day at least, along X where times are MJD; False where they only count."""
     mjd = np.asarray(mjd, float)
-    low, high = (
-        axis.dataLim.intervalx
-    )  # of a single date matplotlib would draw a tenth of all days since 1970
+    # Of a single date matplotlib would draw a tenth of all days since 1970.
+    low, high = axis.dataLim.intervalx
     margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
     axis.set_xlim(low - margin, high + margin)
     if not mjd.size or not np.nanmin(mjd) > FIRST_DATE:
@@ -419,9 +423,8 @@ def matrix_panels(
         low, high = (100.0 * float(edge(maps[i])) for edge in (np.min, np.max))
         span = f"{_short(low, high - low)} to {_short(high, high - low)} %"
         field_axes(axis, f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}")
-        colour_bar(
-            figure, pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth), axis
-        )
+        image = pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth)
+        colour_bar(figure, image, axis)
         if weak is not None and i > 3 and weak.min() < SMALLEST_DETERMINANT < weak.max():
             axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=field, colors="0.15", linewidths=0.7)
     outer_labels(axes)

@@ -42,13 +42,11 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -
         time, segments = day_of(mjd), np.searchsorted(steps, mjd)
         for segment in range(len(steps) + 1):
             at = segments == segment
-            axis.fill_between(
-                time[at], (value - error)[at], (value + error)[at], color=AFTER, alpha=0.3, lw=0
-            )
+            low, high = (value - error)[at], (value + error)[at]
+            axis.fill_between(time[at], low, high, color=AFTER, alpha=0.3, lw=0)
             axis.plot(time[at], value[at], color=AFTER, lw=1.2)
-        axis.errorbar(
-            time, value + alone, alone_error, fmt="o", ms=2.5, mfc="white", lw=0.7, color="0.45", zorder=1.5
-        )
+        look = {"ms": 2.5, "mfc": "white", "lw": 0.7, "color": "0.45", "zorder": 1.5}
+        axis.errorbar(time, value + alone, alone_error, fmt="o", **look)
         for entry in breaks:
             if entry["kind"] == "step":
                 axis.axvspan(*day_of([entry["before"], entry["after"]]), color=QUIET, lw=0, zorder=0)
@@ -78,17 +76,13 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
 
 @styled
 def watch_figure(found: Watch) -> Figure:
-    """Gain of every camera (per cent, since the calibration, that camera alone) by exposure group.
-
-    The band is the smallest step from there on that is found in 99 % of cases; lines are changes that were found.
-    """
+    """Gain of every camera since the calibration (%) by group; band: smallest step seen in 99 %, lines: changes."""
     count = len(found.cameras)
     figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True, squeeze=False)
     named = {change.camera for change in found.changes}
     for k, axis in enumerate(axes[:, 0]):
-        gain, error, detectable = (
-            100.0 * values[:, k] for values in (found.gain, found.error, found.smallest)
-        )
+        of_camera = (values[:, k] for values in (found.gain, found.error, found.smallest))
+        gain, error, detectable = (100.0 * values for values in of_camera)
         time = day_of(found.time)
         axis.fill_between(time, -detectable, detectable, color=QUIET, lw=0, step=None)
         colour = BEFORE if found.cameras[k] in named else AFTER

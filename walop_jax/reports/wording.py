@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -14,7 +13,7 @@ from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.io.text import date_of, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.free_form import FreeForm
-from walop_jax.reports.posterior_figures import LABELS
+from walop_jax.reports.style import texts
 from walop_jax.sky.nights import night_of
 
 _PROPER = ("Wollaston", "Moon", "Stokes")
@@ -43,9 +42,8 @@ _KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standar
 def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
     e = product.exposures
-    kinds = ", ".join(
-        f"{number} {_KINDS.get(kind, kind)}" for kind, number in Counter(e.kind.tolist()).items()
-    )
+    counts = Counter(e.kind.tolist()).items()
+    kinds = ", ".join(f"{number} {_KINDS.get(kind, kind)}" for kind, number in counts)
     low_x, high_x, low_y, high_y = product.field
     rows = [
         ("Nights", _nights(e.mjd, product.site.longitude)),
@@ -120,11 +118,5 @@ def names_in_words(names: Iterable[str]) -> str:
 
 def symbols_in_words(names: Sequence[str]) -> str:
     """The symbols that figures of a posterior use, and their names."""
-    greek = {"\\delta": "δ", "\\kappa": "κ", "\\eta": "η", "\\ln": "ln"}
-    symbols = []
-    for name in names:
-        symbol = re.sub(r"[${}]", "", LABELS.get(name, ""))
-        for code, letter in greek.items():
-            symbol = symbol.replace(code, letter)
-        symbols += [f"{symbol} {name}"] if symbol else []
+    symbols = [f"{texts('symbols')[name][1]} {name}" for name in names if name in texts("symbols")]
     return f" Symbols: {', '.join(symbols)}." if symbols else ""

@@ -104,15 +104,12 @@ class Affected(Displayed):
 def affected(
     old: Calibration, new: Calibration, catalogue: Catalogue, name: str, limit: float = LIMIT
 ) -> Iterator[NightShift]:
-    """The nights of a catalogue, called `name`, with the shift of its stars when `new` takes the place of `old`.
-
-    A star with rows of several nights, which are one result, is one of each of them.
-    """
+    """The nights of a catalogue, called `name`, with the shift of its stars; one of several nights is in each."""
     before, after = results_of(old, catalogue), results_of(new, catalogue)
     evening, star = night_of(catalogue.time, old.site.longitude), catalogue.star
     dated, everyone = np.isin(star, star[np.isfinite(evening)]), np.arange(len(before.qu))
     beyond = np.isin(everyone, star[new.beyond_settings(catalogue.points.settings)])
-    then, now = (~np.isnan(stars.qu).any(axis=1) for stars in (before, after))
+    measured_before, measured_after = (~np.isnan(stars.qu).any(axis=1) for stars in (before, after))
     every_z = shift(before, after)
     bad = Quality.NOT_CONVERGED | Quality.UNEXPLAINED
     verdicts = {int(np.bitwise_and.reduce(stars.flag)) & bad for stars in (before, after)}
@@ -120,17 +117,18 @@ def affected(
         rows = evening == night if np.isfinite(night) else ~dated
         if not rows.any():
             continue
-        here = np.isin(everyone, star[rows])
-        twice = here & then & now
+        of_night = np.isin(everyone, star[rows])
+        twice = of_night & measured_before & measured_after
         weight = 1.0 / np.diagonal(before.covariance[twice], axis1=1, axis2=2)
         change, z = (after.qu - before.qu)[twice], every_z[twice]
         mean = np.average(change, axis=0, weights=weight) if z.size else np.zeros(2)
-        median, most, largest = map(float, np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3))
-        lost, gained = int((here & then & ~now).sum()), int((here & now & ~then).sum())
+        median, quantile, largest = map(float, np.quantile(z, [0.5, MOST, 1.0]) if z.size else np.zeros(3))
+        lost = int((of_night & measured_before & ~measured_after).sum())
+        gained = int((of_night & measured_after & ~measured_before).sum())
         yield NightShift(
-            name, float(night), int(here.sum()), median, most, largest, float(mean[0]), float(mean[1]),
-            above=int((z > limit).sum()), lost=lost, gained=gained, beyond=int((beyond & here).sum()),
-            again=most > limit or lost + gained > 0 or len(verdicts) > 1,
+            name, float(night), int(of_night.sum()), median, quantile, largest, float(mean[0]), float(mean[1]),
+            above=int((z > limit).sum()), lost=lost, gained=gained, beyond=int((beyond & of_night).sum()),
+            again=quantile > limit or lost + gained > 0 or len(verdicts) > 1,
         )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals
 from walop_jax.sky.moon import sky_to_instrument
 
+OfRows = Float[np.ndarray, "r k"]  # by row and camera
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
@@ -126,10 +127,7 @@ def _joined(parts: list[Stars]) -> Stars:
 def residuals_of(
     vectors: AnalysisVectors, catalogue: Catalogue, rows: int = STAR_SAMPLE, *, force: bool = False
 ) -> list[StarResiduals]:
-    """Residuals of the stars of a catalogue, of about `rows` of its rows at most; none where no camera is to spare.
-
-    Raises `DataError` as `apply` does.
-    """
+    """Residuals of stars, of about `rows` rows at most; none without a camera to spare. `DataError` as in `apply`."""
     work = _Application(vectors, catalogue, force=force)
     chosen = work.sample(rows)
     return [
@@ -147,7 +145,7 @@ class _Block(NamedTuple):
     stars: Stars
     found: Estimate
     vectors: Float[np.ndarray, "r k 3"]
-    sigma: Float[np.ndarray, "r k"]
+    sigma: OfRows
     plain: Float[np.ndarray, "r k o"]
     throughput: Float[np.ndarray, "r k k"]
     colour: Float[np.ndarray, "r k 2"]
@@ -194,9 +192,8 @@ class _Application:
         on_sky = np.stack([mixed[..., 0], *axes], axis=-1)
         fitted = estimate(on_sky, used, sigma, star, vectors.instrument.cameras)
 
-        s = np.stack(
-            [np.ones(len(rows)), *sky_to_instrument(fitted.qu[star, 0], fitted.qu[star, 1], rotator)], axis=1
-        )
+        towards = sky_to_instrument(fitted.qu[star, 0], fitted.qu[star, 1], rotator)
+        s = np.stack([np.ones(len(rows)), *towards], axis=1)
         # Of the model per unit flux, to the plain parameters and to the throughputs.
         plain = np.empty((len(rows), vectors.cameras, vectors.plain))
         throughput = np.empty((len(rows), vectors.cameras, vectors.cameras))
@@ -211,9 +208,8 @@ class _Application:
             local = vectors.derivatives(self.settings[k], x[same], y[same], teff[same])
             plain[same], throughput[same] = (np.einsum("rs,rksf->rkf", s[same], slopes) for slopes in local)
             gain = fitted.gain[same]
-            derivative[same] = vectors.to_parameters(
-                gain @ plain[same], gain @ throughput[same], x[same], y[same]
-            )
+            of_plain, of_throughput = gain @ plain[same], gain @ throughput[same]
+            derivative[same] = vectors.to_parameters(of_plain, of_throughput, x[same], y[same])
         lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         for p, change in detector_slopes(vectors, counts):
             change = np.nan_to_num(change) / lit[:, None]
@@ -223,10 +219,10 @@ class _Application:
             derivative += (fitted.gain @ turned[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
 
-        def change_of(weights: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r k"]:
+        def change_of(weights: Float[np.ndarray, "r c"]) -> OfRows:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
 
-        def shift(change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "s 2"]:
+        def shift(change: OfRows) -> Float[np.ndarray, "s 2"]:
             return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
 
         hidden = _hidden(vectors, derivative, {number: shift(change) for number, change in acting.items()})
@@ -272,11 +268,7 @@ class _Application:
         )
 
     def flags(
-        self,
-        rows: Int[np.ndarray, " r"],
-        counts: Float[np.ndarray, "r k"],
-        first: Int[np.ndarray, " s"],
-        found: Estimate,
+        self, rows: Int[np.ndarray, " r"], counts: OfRows, first: Int[np.ndarray, " s"], found: Estimate
     ) -> Int[np.ndarray, " s"]:
         """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
         points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
@@ -321,9 +313,8 @@ class _Application:
         root = np.where(used, 1.0 / np.where(used, sigma, 1.0), 0.0)
         a, qu = block.vectors[r], stars.qu[block.star[r]]
         unit = root * np.einsum("rks,rs->rk", a, np.concatenate([np.ones((len(qu), 1)), qu], axis=1))
-        flux, residual = eliminate_flux(
-            root * np.where(used, counts, 0.0), unit, np.zeros(len(r), bool), shared
-        )
+        weighed = root * np.where(used, counts, 0.0)
+        flux, residual = eliminate_flux(weighed, unit, np.zeros(len(r), bool), shared)
         model, scale = flux * unit, (flux * root)[..., None]
         tangent = project_flux(np.moveaxis(scale * a[..., 1:], -1, 0), model, False, shared)
         x, y = catalogue.points.x[rows], catalogue.points.y[rows]
@@ -394,10 +385,7 @@ class _Application:
     def _changed(
         self, block: _Block, check: CatalogueCheck
     ) -> tuple[Float[np.ndarray, "s 2 2"], Bool[np.ndarray, " s"]]:
-        """Effect of the changes on stars, and which of them lie at one of the places.
-
-        The largest, in q and in u, of the changes that cannot be separated.
-        """
+        """Effect on stars of changes, of those alike the largest in q and in u; True for stars at a place."""
         points, fitted = self.catalogue.points, block.found
         cameras = self.vectors.instrument.cameras.names
         parameters = [name for name, _ in self.vectors.named]

@@ -28,6 +28,7 @@ from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
 
+Counts = Float[np.ndarray, "n k"]  # by row and camera
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 SAME_PLACE = 1.0  # arcsec
 ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
@@ -47,8 +48,8 @@ class Catalogue:
 
     points: FieldPoints
     teff_err: Float[np.ndarray, " n"]
-    counts: Float[np.ndarray, "n k"]
-    sigma: Float[np.ndarray, "n k"]
+    counts: Counts
+    sigma: Counts
     spoilt: Bool[np.ndarray, " n"]
     copy: Bool[np.ndarray, " n"]
     repeated: Bool[np.ndarray, " n"]
@@ -56,7 +57,7 @@ class Catalogue:
     rotator: Float[np.ndarray, " n"]
     time: Float[np.ndarray, " n"]
     remarks: tuple[str, ...] = ()
-    sky: Float[np.ndarray, "n k"] | None = None
+    sky: Counts | None = None
 
     def __len__(self) -> int:
         return len(self.star)
@@ -161,9 +162,8 @@ def _with_colours(
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):
         limits = f"{LIMITS[0]:g} … {LIMITS[1]:g} mag"
-        source.remarks.append(
-            f"BP_RP of {beyond} rows lies beyond {limits}: their errors are those of unknown colours"
-        )
+        what = "their errors are those of unknown colours"
+        source.remarks.append(f"BP_RP of {beyond} rows lies beyond {limits}: {what}")
     settings = dataclasses.replace(points.settings, teff=np.where(within, temperature, teff))
     return dataclasses.replace(points, settings=settings), np.where(within, off, error)
 
@@ -218,10 +218,7 @@ _NO_ID = (*MISSING, "-1", "unknown")
 
 
 def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
-    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own.
-
-    IDs that are missing, empty or negative are none.
-    """
+    """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own."""
     rows = np.arange(source.rows)
     named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
     column = source.column(named)
@@ -244,9 +241,8 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
         unknown = ~missing & (negative | np.isin(np.char.lower(values), _NO_ID))
     if unknown.any():
         which = rows_text(np.flatnonzero(unknown))
-        source.remarks.append(
-            f"{named} is {values[unknown][0]} in {which}: unknown, a star of its own in each row"
-        )
+        what = "unknown, a star of its own in each row"
+        source.remarks.append(f"{named} is {values[unknown][0]} in {which}: {what}")
     name = np.unique(values, return_inverse=True)[1].reshape(-1)
     return _numbered(name, missing | unknown, points)
 
@@ -270,12 +266,10 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
     name[located] = same_stars(ra[located], dec[located], SAME_PLACE)
     # Two stars of one exposure are two stars, however close: by time, or by the place in the field where it is unknown.
     cell = np.round(np.stack([points.x, points.y], axis=1) / ANOTHER_PLACE)
-    exposure = np.where(
-        np.isfinite(time)[:, None], np.stack([time, np.full(len(time), np.inf)], axis=1), cell
-    )
-    _, of, count = np.unique(
-        np.column_stack([name, exposure]), axis=0, return_inverse=True, return_counts=True
-    )
+    dated = np.stack([time, np.full(len(time), np.inf)], axis=1)
+    exposure = np.where(np.isfinite(time)[:, None], dated, cell)
+    key = np.column_stack([name, exposure])
+    _, of, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     crowded = np.zeros(name.max() + 1, bool)
     crowded[name[count[of.reshape(-1)] > 1]] = True
     alone = ~located | crowded[name]
@@ -290,8 +284,8 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
 def _copies(
     source: InputTable,
     points: FieldPoints,
-    counts: Float[np.ndarray, "n k"],
-    sigma: Float[np.ndarray, "n k"],
+    counts: Counts,
+    sigma: Counts,
     rotator: Float[np.ndarray, " n"],
     star: Int[np.ndarray, " n"],
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
@@ -307,9 +301,8 @@ def _copies(
         cameras = np.flatnonzero(pattern)
         rows = np.flatnonzero(counted[:, cameras].all(axis=1)) if len(cameras) > 1 else cameras[:0]
         rows = rows[np.argsort(-counted[rows].sum(axis=1), kind="stable")]
-        group = equal_rows(
-            [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T, points.x[rows], points.y[rows]]
-        )
+        numbers = [*counts[rows][:, cameras].T, *sigma[rows][:, cameras].T]
+        group = equal_rows([*numbers, points.x[rows], points.y[rows]])
         _, best = np.unique(group, return_index=True)
         same[rows] = same[rows[best[group]]]
     copy = repeated = np.zeros(len(star), bool)

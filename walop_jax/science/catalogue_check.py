@@ -43,6 +43,7 @@ from walop_jax.science.star_residuals import (
     FEW,
     NO_NOISE,
     SINGULAR,
+    Residuals,
     Scale,
     StarResiduals,
     Weights,
@@ -66,6 +67,7 @@ _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far 
 _REFERENCE = 1e6  # electron
 
 Vector = Float[np.ndarray, " r"]  # a number for each row
+Sizes = Float[np.ndarray, " c"]  # of all columns
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
 
 
@@ -99,11 +101,10 @@ class CatalogueCheck:
 
     `noise` is χ² per degree of freedom behind the changes (1 expected; without outliers) and `noise_p` its chance;
     `rows` the factor by which the common variance of the rows of a star exceeds N_ERR, None where every star has
-    one row, and `rows_p` its chance beside `noise`. `scale` are the factors on the photon covariance of stars of one
-    row and of several: 1 unless errors are off. `tests` are the `asked` questions in their first answer; `smallest` is
-    the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and `rows_used`
-    count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky` is
-    the light of the sky left over (None: its level is not stated).
+    one row, and `rows_p` its chance beside `noise`. `tests` are the `asked` questions in their first answer;
+    `smallest` is the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and
+    `rows_used` count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky`
+    is the light of the sky left over (None: its level is not stated).
     """
 
     stars: int
@@ -113,7 +114,6 @@ class CatalogueCheck:
     noise_p: float
     rows: float | None
     rows_p: float
-    scale: tuple[float, float]
     tests: tuple[PossibleChange, ...]
     changes: tuple[InstrumentChange, ...]
     smallest: float
@@ -138,6 +138,13 @@ class CatalogueCheck:
         if self.rows is None or self.rows < NO_NOISE:
             return False
         return self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Factors on the photon covariance of stars of one row and of several: 1 unless errors are off."""
+        single = self.noise if self.noise_is_off else 1.0
+        # χ² of rows that repeat each other does not test N_ERR: their common part does.
+        return single, self.rows if self.rows is not None and self.rows_agree else single
 
     @property
     def holds(self) -> bool:
@@ -203,7 +210,7 @@ class CatalogueCheck:
         }
 
 
-NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (1.0, 1.0), (), (), np.nan)
+NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (), (), np.nan)
 """Of a catalogue in which no row has a camera to spare."""
 
 
@@ -234,22 +241,19 @@ class CatalogueSearch:
             middle, half = 0.5 * float(times.min() + times.max()), 0.5 * float(np.ptp(times))
             self.growth = self.growth._replace(middle=middle, half=half)
         kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.growth.half > 0]
-        self.kinds = kinds
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.cameras = tuple(cameras)
-        self.questions = [
+        self.of_cameras = [
             PossibleChange(name, True, kind=kind, unit=units.get(kind, ""))
             for kind in kinds
             for name in cameras
         ]
         plain = stars.plain.shape[-1]
-        self.questions += [
-            PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain]
-        ]
+        optics = (PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain])
+        self.questions = [*self.of_cameras, *optics]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
-        count, shown = len(kinds) * len(cameras), len(root)
-        questions, nuisances = count + plain, self.root.shape[1]
-        self.asked = questions
+        count, shown, nuisances = len(self.of_cameras), len(root), self.root.shape[1]
+        questions = self.asked = len(self.questions)
         self.mixing = np.zeros((count + shown + 2, questions + nuisances + 2))
         self.mixing[:questions, :questions] = np.eye(questions)
         self.mixing[count : count + shown, questions : questions + nuisances] = self.root
@@ -265,26 +269,26 @@ class CatalogueSearch:
         values = np.zeros((*part.model.shape, len(self.mixing)))
         place = (part.x, part.y, part.time)
         relative = np.where(part.root > 0, part.model / np.where(part.root > 0, part.root, 1.0), 0.0)
-        for column, change in enumerate(change for change in self.questions if change.camera):
+        for column, change in enumerate(self.of_cameras):
             k = column % cameras
             grown = self.growth.electrons(change, *place, relative[:, k])
             values[:, k, column] = grown * part.root[:, k]
-        values[..., len(self.kinds) * cameras : -2] = part.parameters()
+        values[..., len(self.of_cameras) : -2] = part.parameters()
         values[..., -2:] = part.colour
         return values
 
-    def _left(self, sizes: Float[np.ndarray, " c"]) -> Float[np.ndarray, "r k"]:
+    def _left(self, sizes: Sizes) -> Residuals:
         """Residuals behind changes of all columns."""
         if np.array_equal(sizes, self.start):
             return self.stars.residual
         amounts = self.mixing @ (sizes - self.start)
         return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
 
-    def _looked(self, sizes: Float[np.ndarray, " c"], *, stated: bool = False) -> _Look:
+    def _looked(self, sizes: Sizes, *, stated: bool = False) -> _Look:
         """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
-        def scale_of(residual: Float[np.ndarray, "r k"]) -> Scale:
+        def scale_of(residual: Residuals) -> Scale:
             return noise_scale(stars.chi2(residual) / self.variance, dof)
 
         residual = self._left(sizes)
@@ -319,7 +323,7 @@ class CatalogueSearch:
             weighted = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
         return weighted
 
-    def _gains(self, look: _Look) -> tuple[Float[np.ndarray, " c"], int]:
+    def _gains(self, look: _Look) -> tuple[Sizes, int]:
         """The gains of the cameras that fit the stars best, among all sizes, and how many numbers these are."""
         cameras = len(self.cameras)
         order = [*range(cameras), *range(self.asked, len(look.score))]
@@ -364,20 +368,15 @@ class CatalogueSearch:
             noise_p=1.0 if self.crowded else chance_of_scale(noise),
             rows=None if rows is None else rows.value,
             rows_p=rows_p,
-            scale=(1.0, 1.0),
             tests=tuple(tests),
             changes=changes,
             smallest=smallest,
             growth=self.growth,
         )
-        # χ² of rows that repeat each other does not test N_ERR: their common part does.
-        single = noise.value if check.noise_is_off else 1.0
-        several = float(rows.value) if rows is not None and check.rows_agree else single
-        check = dataclasses.replace(check, scale=(single, several))
         return dataclasses.replace(check, places=self._places(check, look, sizes, chosen))
 
     def _places(
-        self, found: CatalogueCheck, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int]
+        self, found: CatalogueCheck, look: _Look, sizes: Sizes, chosen: list[int]
     ) -> tuple[DisagreeingPlace, ...]:
         """Places where stars disagree together, behind the changes and the errors of the calibration."""
         single, several = (max(scale, found.noise, 1.0) for scale in found.scale)
@@ -390,7 +389,7 @@ class CatalogueSearch:
                 break
         return places
 
-    def _explained(self) -> Float[np.ndarray, " c"] | None:
+    def _explained(self) -> Sizes | None:
         """Errors of the calibration that explain the stars best with N_ERR as stated; None if they cannot be."""
         _, sizes = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
         errors = sizes[self.asked : -2]
@@ -405,7 +404,7 @@ class CatalogueSearch:
         errors[self.matters] = self.nearest[self.asked : -2]
         return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
 
-    def bend(self, errors: Float[np.ndarray, " n"], residual: Float[np.ndarray, "r k"]) -> float:
+    def bend(self, errors: Float[np.ndarray, " n"], residual: Residuals) -> float:
         """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
         sizes = self.start.copy()
         sizes[self.asked : -2] = errors[self.matters]
@@ -424,8 +423,8 @@ class CatalogueSearch:
         return min(rows, chance_of_scale(look.noise), chance_of(strongest)) < near
 
     def _settled(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], *, stated: bool = False
-    ) -> tuple[_Look, Float[np.ndarray, " c"]]:
+        self, look: _Look, sizes: Sizes, chosen: list[int], *, stated: bool = False
+    ) -> tuple[_Look, Sizes]:
         """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
@@ -440,7 +439,7 @@ class CatalogueSearch:
         return look, sizes
 
     def _beside(
-        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], chosen: list[int]
+        self, matrix: Float[np.ndarray, "c c"], score: Sizes, chosen: list[int]
     ) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
@@ -453,9 +452,7 @@ class CatalogueSearch:
                 sizes[n] = sizes[n]._replace(size=float(slope * error**2), error=error)
         return sizes
 
-    def _change(
-        self, look: _Look, sizes: Float[np.ndarray, " c"], chosen: list[int], asked: int
-    ) -> InstrumentChange:
+    def _change(self, look: _Look, sizes: Sizes, chosen: list[int], asked: int) -> InstrumentChange:
         """A detected change, and its rivals."""
         away = np.zeros_like(sizes)
         away[asked] = sizes[asked]
@@ -477,7 +474,7 @@ class _Look(NamedTuple):
     noise: Scale
     rows: Scale | None
     matrix: Float[np.ndarray, "c c"]
-    score: Float[np.ndarray, " c"]
+    score: Sizes
 
 
 def _chance_beside(rows: Scale, noise: Scale) -> float:

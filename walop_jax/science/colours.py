@@ -30,10 +30,7 @@ def temperature(colour: Float[np.ndarray, " n"], kind: tuple[float, float, float
 def temperature_of(
     colour: Float[np.ndarray, " n"], error: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Temperature and its standard error (K) from BP − RP and its error (mag; NaN: `COLOUR_ERROR`).
-
-    NaN beyond `LIMITS`.
-    """
+    """Temperature and standard error (K) from BP − RP and its error (mag; NaN: `COLOUR_ERROR`); NaN beyond `LIMITS`."""
     inside = (colour >= LIMITS[0]) & (colour <= LIMITS[1])
     colour = np.where(inside, colour, np.nan)
     error = np.where(np.isfinite(error), error, COLOUR_ERROR)

@@ -67,10 +67,7 @@ def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate(Displayed):
-    """The checks of a product and its requirements for stars, its range of application, hash, and parents.
-
-    `content` is its content hash, `parents` are the SHA-256 of its inputs.
-    """
+    """Checks of a product, requirements for stars, validity, hash (`content`), SHA-256 of its inputs (`parents`)."""
 
     path: Path
     checks: tuple[Check, ...]

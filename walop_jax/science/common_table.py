@@ -133,9 +133,8 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
         elif entry.of in present and name not in cells:
             column = number(entry.of)[keep]
             cells[name] = column.astype(np.int64) if name in _WHOLE else column
-    described = {
-        name: (cells[name], entry.unit, entry.about) for name, entry in columns().items() if name in cells
-    }
+    made = {name: entry for name, entry in columns().items() if name in cells}
+    described = {name: (cells[name], entry.unit, entry.about) for name, entry in made.items()}
     carried = ("CALHASH", "PESTIM", "HOLDS", "TRUSTED", "ERRFROM")
     meta = {key: source.table.meta[key] for key in carried if key in source.table.meta}
     cards = {"POLCCONV": "IAU", "TIMESYS": "UTC", "RADESYS": "ICRS", "REFERENC": REFERENCE}

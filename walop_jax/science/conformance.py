@@ -65,9 +65,8 @@ class Conformance(Displayed):
             if not mistake or len(group) == 1:
                 notes += map(str, group)
             else:
-                notes.append(
-                    f"{mistake}: {some([f'{answer.case} {answer.quantity}' for answer in group], SHOWN)}"
-                )
+                names = [f"{answer.case} {answer.quantity}" for answer in group]
+                notes.append(f"{mistake}: {some(names, SHOWN)}")
         right = self.asked - len(self.deviations)
         return Display(f"{right} of {self.asked} numbers are right", notes=tuple(notes))
 
@@ -128,7 +127,6 @@ def answers_of(path: Path) -> dict[Key, float | None]:
             answers[key] = float(text) if text else None
         except ValueError:
             advice = "correct it or leave it empty"
-            raise fail(
-                f"{text!r} is not a number, {where}", file=path, column="VALUE", advice=advice
-            ) from None
+            what = f"{text!r} is not a number, {where}"
+            raise fail(what, file=path, column="VALUE", advice=advice) from None
     return answers

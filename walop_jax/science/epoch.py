@@ -31,10 +31,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.calibration.accuracy import sample_stars
+from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT, sample_stars
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.thresholds import SMALLEST_DETERMINANT
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS, model_like
@@ -55,9 +54,7 @@ COPIES = 1e-12  # chance of so small a χ² from which two sets are taken for on
 _SHOWN = 8  # parameters
 SURE = 5.0  # standard errors
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
-_LEANS = (
-    1e-4  # of the variances of both fits, below which both lean on the prior and rounding is all that differs
-)
+_LEANS = 1e-4  # of the variances of both fits, below which both are the prior, and rounding differs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,9 +147,7 @@ class Epoch(Displayed):
         """The verdict, and the parameters that have moved farthest."""
         title, largest = self.verdict.replace("has changed", "HAS CHANGED"), self.largest
         if largest is None or self.star_errors is None or self.visible is None or self.p_value is None:
-            words = (
-                "not compared: the model of the old calibration, fitted to the new data, is not to be trusted"
-            )
+            words = "not compared: the old model, fitted to the new data, is not to be trusted"
             return Display(title, (("old and new", words),))
         if self.same:
             return Display(title, (("old and new", "the same data: nothing can have changed"),))
@@ -287,10 +282,7 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
 
 
 class MeasuredChange(NamedTuple):
-    """A change in units of `sigma`, for the parameters that were known at all, and V⁻¹ over the measured directions.
-
-    `directions` is the number of those that were measured.
-    """
+    """A change in units of `sigma`, for parameters known at all, and V⁻¹ over the measured `directions`, a number."""
 
     names: tuple[str, ...]
     change: Float[np.ndarray, " k"]
@@ -334,9 +326,8 @@ class MeasuredChange(NamedTuple):
     def largest(self) -> LargestChange:
         """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
         variances, alone = np.diag(self.covariance), np.diag(self.inverse)
-        width = np.sqrt(
-            np.stack([np.where(variances > _LEANS, variances, np.inf), np.where(alone > 0, alone, np.inf)])
-        )
+        widths = np.where(variances > _LEANS, variances, np.inf), np.where(alone > 0, alone, np.inf)
+        width = np.sqrt(np.stack(widths))
         z = np.stack([self.change, self.inverse @ self.change]) / width
         way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
         questions = int(np.isfinite(width).sum())

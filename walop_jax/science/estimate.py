@@ -33,6 +33,8 @@ CONVERGED = 1e-13  # of the largest step in q, u, or 1e-9 σ
 SINGULAR = 1e-13  # determinant over squared mean of an information matrix
 _SETTLED = 1e-9
 
+Counts = Float[np.ndarray, "r k"]  # by row and camera
+Rows = Int[np.ndarray, " r"]
 Rows3 = Float[np.ndarray, "r 3"]
 
 
@@ -56,9 +58,9 @@ class Estimate:
 
 def estimate(
     vectors: Float[np.ndarray, "r k 3"],
-    counts: Float[np.ndarray, "r k"],
-    sigma: Float[np.ndarray, "r k"],
-    star: Int[np.ndarray, " r"],
+    counts: Counts,
+    sigma: Counts,
+    star: Rows,
     cameras: Cameras | None = None,
 ) -> Estimate:
     """Stokes parameters of stars from rows of intensities.
@@ -112,7 +114,7 @@ def estimate(
 
 
 def calibration_shift(
-    gain: Float[np.ndarray, "r 2 k"], change: Float[np.ndarray, "r k m"], star: Int[np.ndarray, " r"]
+    gain: Float[np.ndarray, "r 2 k"], change: Float[np.ndarray, "r k m"], star: Rows
 ) -> Float[np.ndarray, "s 2 m"]:
     """Shift of every star's (q, u) when the model counts per unit flux of its rows change by `change`.
 
@@ -149,15 +151,14 @@ def _inverse(
     determinant = a * d - b * b
     good = determinant > SINGULAR * mean**2
     safe = np.where(good, determinant, 1.0)
-    inverse = (
-        np.stack([np.stack([d, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2) / safe[:, None, None]
-    )
+    adjoint = np.stack([np.stack([d, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
+    inverse = adjoint / safe[:, None, None]
     condition = np.where(good, (mean + half) / np.sqrt(safe), np.inf)
     return np.where(good[:, None, None], inverse, np.nan), condition
 
 
 def _start(
-    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Int[np.ndarray, " r"], first: Int[np.ndarray, " s"]
+    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Rows, first: Int[np.ndarray, " s"]
 ) -> Float[np.ndarray, "s 2"]:
     """The exact minimum F (1, q, u) = G⁻¹ b for stars of one row, (0, 0) for the others."""
     start = np.zeros((len(first), 2))
@@ -173,7 +174,7 @@ def _start(
 
 
 def _minimise(
-    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Int[np.ndarray, " r"], first: Int[np.ndarray, " s"]
+    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Rows, first: Int[np.ndarray, " s"]
 ) -> tuple[Float[np.ndarray, "s 2"], Bool[np.ndarray, " s"]]:
     """(q, u) of least χ², and for which stars the steps have settled at a flux above 0."""
     qu = _start(gram, moment, star, first)

@@ -14,10 +14,9 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.accuracy import measures_u, p_errors, p_forms, sample_stars
+from walop_jax.calibration.accuracy import GOAL, measures_u, p_errors, p_forms, sample_stars
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
@@ -167,10 +166,7 @@ class FieldAccuracy:
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """A requirement on a calibration: whether it is met, the result, and advice if not.
-
-    One that is not `needed` is no reason against a go.
-    """
+    """A requirement on a calibration: whether it is met, the result, advice if not; `needed`: a reason against a go."""
 
     what: str
     met: bool

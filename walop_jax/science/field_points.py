@@ -132,9 +132,8 @@ def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"],
         return
     degrees = np.rad2deg(turned)
     if np.all(np.abs(degrees - np.round(degrees)) < _WHOLE):
-        what = (
-            f"has no unit and is a whole number of degrees in radians ({turned[0]:.6g} = {degrees[0]:.0f}°)"
-        )
+        number = f"{turned[0]:.6g} = {degrees[0]:.0f}°"
+        what = f"has no unit and is a whole number of degrees in radians ({number})"
         raise place.fail(what, name, "give degrees, or state the unit of the column")
     source.remarks.append(f"{name} has no unit and lies within ±2π: taken to be degrees; are these radians?")
 
@@ -142,15 +141,11 @@ def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"],
 def true_matrices(
     path: str | os.PathLike[str], instrument: Instrument
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm.
-
-    Raises `DataError` for values that are missing or not finite.
-    """
+    """X, Y (deg) and M21, M22, … of a table of true matrices, three for each arm; `DataError` if not finite."""
     source = read_input_table(path)
     points = field_points(source, instrument)
     names = [f"M{arm + 2}{column}" for arm in range(len(instrument.cameras.pairs)) for column in (1, 2, 3)]
     matrix = np.stack([numeric_column(source, name, Column("float")) for name in names], axis=1)
-    Place(path, "").refuse(
-        ~np.isfinite(matrix), "not finite", f"{names[0]} … {names[-1]}", "remove these rows"
-    )
+    names = f"{names[0]} … {names[-1]}"
+    Place(path, "").refuse(~np.isfinite(matrix), "not finite", names, "remove these rows")
     return points.x, points.y, matrix

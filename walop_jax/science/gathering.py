@@ -42,11 +42,8 @@ BLEND = 8  # bit of N_FLAG
 FEWEST = 0.2  # of the stars of a camera must be those of the others
 MISSING = 0.2  # of the stars that all others see, from which on a camera is remarked on
 SAME_FLUXES = 0.5  # of the stars of two cameras: one is a copy of the other
-APART = {
-    "MJD": 0.01,
-    "TEMP": 0.5,
-    "HA": 0.05,
-}  # between catalogues of one exposure; other values are the same
+APART = {"MJD": 0.01, "TEMP": 0.5, "HA": 0.05}
+"""Largest differences between catalogues of one exposure; other values are the same."""
 DIGITS = 1e-3  # to which cameras agree on a number of a star
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
 Columns = dict[str, tuple[np.ndarray, str, str]]
@@ -84,10 +81,8 @@ def gather(
     places = [_place(camera, pointing) for camera in catalogues]
     moves = _registrations(catalogues, places, tolerance)
     texts = dict.fromkeys(text for camera in catalogues for text in camera.remarks)
-    remarks = [
-        f"{', '.join(str(camera.path) for camera in catalogues if text in camera.remarks)}: {text}"
-        for text in texts
-    ]
+    having = {text: [str(camera.path) for camera in catalogues if text in camera.remarks] for text in texts}
+    remarks = [f"{', '.join(paths)}: {text}" for text, paths in having.items()]
     remarks += _about_moves(moves, names, tolerance)
     places = [move.apply(place) for move, place in zip(moves, places, strict=True)]
     index, ambiguous, place = _matched(places, tolerance)
@@ -107,9 +102,8 @@ def gather(
                 "detection threshold that of the others? Their q and u come from the others alone (FLAG 128)"
             )
     if doubtful := int(ambiguous.any(axis=1).sum()):
-        remarks.append(
-            f"{doubtful} stars have two candidates within {tolerance:g} arcsec: not used in that camera"
-        )
+        what = f"have two candidates within {tolerance:g} arcsec: not used in that camera"
+        remarks.append(f"{doubtful} stars {what}")
     columns, about = _columns(catalogues, pointing, index, ambiguous, place)
     return Gathered(columns, pointing, moves, detected.sum(axis=1), (*remarks, *about))
 
@@ -119,9 +113,8 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
 
     `table` is a path, an astropy table, or columns by name. Positions are registered first, as between cameras.
     """
-    source = (
-        read_input_table(table, ("RA", "DEC")) if isinstance(table, str | os.PathLike) else in_memory(table)
-    )
+    read = isinstance(table, str | os.PathLike)
+    source = read_input_table(table, ("RA", "DEC")) if read else in_memory(table)
     if not set(OF_STARS) & set(source.names):
         raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
     ra, dec = sky_positions(source)
@@ -178,9 +171,8 @@ def _registrations(
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
             what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
-            raise fail(
-                what + where, file=camera.path, advice="is it of the same field, and is its WCS right?"
-            )
+            advice = "is it of the same field, and is its WCS right?"
+            raise fail(what + where, file=camera.path, advice=advice)
         moves.append(move)
     shift = np.median([move.shift for move in moves], axis=0)
     rotation = float(np.median([move.rotation for move in moves]))
@@ -219,11 +211,10 @@ def _matched(
         count = (index[stars] >= 0).sum(axis=1, keepdims=True)
         place[stars] = (count * place[stars] + places[k][rows]) / (count + 1)
         index[stars, k], ambiguous[stars, k] = rows, doubtful[rows]
-        additions = np.full((len(new), cameras), -1)
-        additions[:, k] = new
-        unsure = np.zeros((len(new), cameras), bool)
-        unsure[:, k] = doubtful[new]
-        index, ambiguous = np.concatenate([index, additions]), np.concatenate([ambiguous, unsure])
+        start = len(index)
+        index = np.pad(index, ((0, len(new)), (0, 0)), constant_values=-1)
+        ambiguous = np.pad(ambiguous, ((0, len(new)), (0, 0)))
+        index[start:, k], ambiguous[start:, k] = new, doubtful[new]
         place = np.concatenate([place, places[k][new]])
     return index, ambiguous, place
 
@@ -264,14 +255,11 @@ def _columns(
     place: Float[np.ndarray, "s 2"],
 ) -> tuple[Columns, list[str]]:
     def of_cameras(values: Sequence[np.ndarray], missing: Any) -> np.ndarray:
-        detected = index >= 0
-        return np.stack(
-            [np.where(detected[:, k], column[index[:, k]], missing) for k, column in enumerate(values)],
-            axis=1,
-        )
+        of_each = zip(index.T, values, strict=True)
+        return np.stack([np.where(row >= 0, column[row], missing) for row, column in of_each], axis=1)
 
     ra, dec = pointing.sky_of(*place.T)
-    flag = of_cameras([camera.flag for camera in catalogues], 0)
+    flag = of_cameras([camera.flag for camera in catalogues], 0) | np.where(ambiguous, BLEND, 0)
     columns: Columns = {
         "RA": (ra, "deg", "right ascension, ICRS"),
         "DEC": (dec, "deg", "declination, ICRS"),
@@ -280,17 +268,12 @@ def _columns(
         "ROTATOR": (pointing.rotator_at(ra, dec), "deg", "position angle of +X at the star"),
         "N": (of_cameras([camera.flux for camera in catalogues], np.nan), "", "electrons in each camera"),
         "N_ERR": (of_cameras([camera.error for camera in catalogues], np.nan), "", "standard errors of N"),
-        "N_FLAG": (
-            (flag | np.where(ambiguous, BLEND, 0)).astype(np.int32),
-            "",
-            "bits of each camera, 0 is good",
-        ),
+        "N_FLAG": (flag.astype(np.int32), "", "bits of each camera, 0 is good"),
     }
     if levels := [camera.sky for camera in catalogues if camera.sky is not None]:
         if len(levels) < len(catalogues):
-            raise fail(
-                "only some cameras have a level of the sky", column="SKY", advice="give it for all, or none"
-            )
+            what = "only some cameras have a level of the sky"
+            raise fail(what, column="SKY", advice="give it for all, or none")
         columns["SKY"] = (of_cameras(levels, np.nan), "", "level of the sky that was subtracted, electrons")
     remarks = []
     for name, (unit, about) in OF_STARS.items():
@@ -300,9 +283,8 @@ def _columns(
         empty = "" if texts else np.nan
         columns_of = [camera.of_stars.get(name, np.full(len(camera), empty)) for camera in catalogues]
         values, differ = _agreed(of_cameras(columns_of, empty), texts)
-        if differ.any():
-            what = f"{name} is not the same in all cameras for {int(differ.sum())} stars: taken as unknown"
-            remarks.append(what)
+        if count := int(differ.sum()):
+            remarks.append(f"{name} is not the same in all cameras for {count} stars: taken as unknown")
         columns[name] = (_whole(values) if texts else values, unit, about)
     for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
         stated = [camera.of_exposure.get(name, "not stated") for camera in catalogues]
@@ -329,11 +311,10 @@ def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarra
     stated = values != "" if texts else np.isfinite(values.astype(float))
     first = np.where(stated.any(axis=1), stated.argmax(axis=1), 0)
     value = values[np.arange(len(values)), first]
-    same = (
-        values == value[:, None]
-        if texts
-        else np.isclose(values.astype(float), value.astype(float)[:, None], rtol=DIGITS, atol=DIGITS)
-    )
+    if texts:
+        same = values == value[:, None]
+    else:
+        same = np.isclose(values.astype(float), value.astype(float)[:, None], rtol=DIGITS, atol=DIGITS)
     differ = np.asarray(np.any(stated & ~same, axis=1))
     return np.where(differ, "" if texts else np.nan, value), differ
 
@@ -341,8 +322,5 @@ def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarra
 def _whole(values: np.ndarray) -> np.ndarray:
     """Identifiers as integers where all are such, -1 for unknown ones."""
     texts = np.where(values == "", "-1", values.astype(str))
-    return (
-        texts.astype(np.int64)
-        if all(text.lstrip("-").isdigit() for text in texts.tolist())
-        else values.astype(str)
-    )
+    integers = all(text.lstrip("-").isdigit() for text in texts.tolist())
+    return texts.astype(np.int64) if integers else values.astype(str)

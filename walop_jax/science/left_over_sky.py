@@ -16,7 +16,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import optimize
 
 from walop_jax.fit.verdict import Quality
@@ -33,6 +33,9 @@ FEWEST = 50  # stars
 MOST = 20_000  # that are looked at
 FAR = 5.0  # standard deviations
 _ROUNDS = 4
+
+
+Vector = Float[np.ndarray, " s"]  # a number for each star
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +61,7 @@ class LeftOverSky:
         """The share that is not exceeded with a probability of 99 %."""
         return float(np.hypot(*self.share) + MOST_LIKELY * self.errors.max())
 
-    def covariance(self, ratio: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 2 2"]:
+    def covariance(self, ratio: Vector) -> Float[np.ndarray, "s 2 2"]:
         """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
         of_share = np.outer(self.share, self.share) + np.diag(self.errors**2)
         return np.where(self.found, ratio**2, 0.0)[:, None, None] * of_share
@@ -86,15 +89,9 @@ class LeftOverSky:
 
 
 def left_over_sky(
-    qu: Float[np.ndarray, "s 2"],
-    photon: Float[np.ndarray, "s 2 2"],
-    light: Float[np.ndarray, " s"],
-    ratio: Float[np.ndarray, " s"],
+    qu: Float[np.ndarray, "s 2"], photon: Float[np.ndarray, "s 2 2"], light: Vector, ratio: Vector
 ) -> LeftOverSky | None:
-    """The sky left over in stars with these (q, u), covariances, light (electron) and ratios of sky to light.
-
-    None where too few stars have all of them, or all have the same ratio.
-    """
+    """The sky left in stars of such light (electron) and sky over light; None of few stars, or of one ratio."""
     good = np.isfinite(qu).all(axis=1) & np.isfinite(photon).all(axis=(1, 2))
     chosen = np.flatnonzero(good & (light > 0) & np.isfinite(ratio) & (ratio >= 0))
     chosen = chosen[np.mod(np.arange(len(chosen)) * 0.6180339887498949, 1.0) < MOST / max(len(chosen), 1)]
@@ -104,40 +101,28 @@ def left_over_sky(
     columns[:, 1] -= columns[:, 1].mean()
     slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
     share, errors = np.array(slopes).T
-    return (
-        LeftOverSky(share, errors, len(chosen)) if np.isfinite(slopes).all() and (errors > 0).all() else None
-    )
+    measured = np.isfinite(slopes).all() and (errors > 0).all()
+    return LeftOverSky(share, errors, len(chosen)) if measured else None
 
 
-def _slope(
-    columns: Float[np.ndarray, "s 3"], values: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]
-) -> tuple[float, float]:
+def _slope(columns: Float[np.ndarray, "s 3"], values: Vector, variance: Vector) -> tuple[float, float]:
     """Coefficient of the last column, and its error."""
     scatter, used = 0.0, np.ones(len(values), bool)
-    for _ in range(_ROUNDS):
-        beta, _, residual = _fitted(columns, values, variance + scatter, used)
-        scatter = _scatter(residual[used], variance[used])
-        used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
-    beta, inverse, residual = _fitted(columns, values, variance + scatter, used)
+    beta, inverse, residual = np.zeros(3), np.eye(3), values
+    for rounds_left in reversed(range(_ROUNDS + 1)):
+        weight = np.where(used, 1.0 / (variance + scatter), 0.0)
+        inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
+        beta = inverse @ (columns.T @ (weight * values))
+        residual = values - columns @ beta
+        if rounds_left:
+            scatter = _scatter(residual[used], variance[used])
+            used = np.abs(residual) < FAR * np.sqrt(variance + scatter)
     pull = np.where(used, residual / (variance + scatter), 0.0)[:, None] * columns
     robust = inverse @ (pull.T @ pull) @ inverse
     return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
 
 
-def _fitted(
-    columns: Float[np.ndarray, "s 3"],
-    values: Float[np.ndarray, " s"],
-    variance: Float[np.ndarray, " s"],
-    used: Bool[np.ndarray, " s"],
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, " s"]]:
-    """Coefficients, their covariance and the residuals."""
-    weight = np.where(used, 1.0 / variance, 0.0)
-    inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
-    beta = inverse @ (columns.T @ (weight * values))
-    return beta, inverse, values - columns @ beta
-
-
-def _scatter(left: Float[np.ndarray, " s"], variance: Float[np.ndarray, " s"]) -> float:
+def _scatter(left: Vector, variance: Vector) -> float:
     """Variance beyond the stated one for which χ² of residuals is their number less three."""
 
     def excess(scatter: float) -> float:

@@ -36,7 +36,7 @@ from walop_jax.science.instrument_changes import (
     chance_of,
     profile,
 )
-from walop_jax.science.star_residuals import StarResiduals, own_variance
+from walop_jax.science.star_residuals import Residuals, StarResiduals, own_variance
 
 CUT = 3.0
 SIZES = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
@@ -48,12 +48,12 @@ _MOST = 8  # places
 _WIDER = 2.0  # than the size that was looked for a place may be, and so far off its centre
 
 
+OfStars = Float[np.ndarray, " s"]
+
+
 @dataclasses.dataclass(frozen=True)
 class DisagreeingPlace:
-    """A place where stars disagree: centre and size (deg), significance, stars, and possible causes (best first).
-
-    That are spots of cameras, whose numbers are `cameras`.
-    """
+    """A place where stars disagree: centre, size (deg), σ, stars, causes (best first): spots of these `cameras`."""
 
     x: float
     y: float
@@ -92,12 +92,12 @@ class DisagreeingPlace:
 class Seen(NamedTuple):
     """Stars at places: positions, z and α of every camera, or of cameras together; χ² and its degrees of freedom."""
 
-    x: Float[np.ndarray, " s"]
-    y: Float[np.ndarray, " s"]
+    x: OfStars
+    y: OfStars
     z: Float[np.ndarray, "s k"]
     alpha: Float[np.ndarray, "s k"]
-    chi2: Float[np.ndarray, " s"]
-    dof: Float[np.ndarray, " s"]
+    chi2: OfStars
+    dof: OfStars
 
     def of(self, chosen: Bool[np.ndarray, " s"]) -> Seen:
         """Some of the stars."""
@@ -120,8 +120,8 @@ class Strongest(NamedTuple):
 def places_of(
     stars: StarResiduals,
     cameras: Sequence[str],
-    residual: Float[np.ndarray, "r k"] | None = None,
-    variance: Float[np.ndarray, " s"] | None = None,
+    residual: Residuals | None = None,
+    variance: OfStars | None = None,
     alarm: float = ALARM,
 ) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
@@ -152,9 +152,7 @@ Sums = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """cᵀr, cᵀPc ahead of q and u, the root of what these take of it, and cᵀc: of rows, or summed over those of a star."""
 
 
-def _sums(
-    stars: StarResiduals, residual: Float[np.ndarray, "r k"], members: Float[np.ndarray, "k c"]
-) -> Sums:
+def _sums(stars: StarResiduals, residual: Residuals, members: Float[np.ndarray, "k c"]) -> Sums:
     """The sums of every row for cameras together: `members` are 1 for those."""
     columns = []
     for _, rows, part in stars.blocks():
@@ -176,9 +174,7 @@ def _seeing(sums: Iterable[np.ndarray], spread: Float[np.ndarray, "s 1"]) -> tup
     return np.where(sees, score / root, 0.0), np.where(sees, root / spread, 0.0)
 
 
-def _seen(
-    stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
-) -> Seen:
+def _seen(stars: StarResiduals, residual: Residuals, variance: OfStars) -> Seen:
     """z and α of the stars; rows of one star at different places are stars of their own."""
     extent = max(float(np.abs([stars.x, stars.y]).max(initial=0.0)), 1e-9)
     cell = np.round(np.stack([stars.x, stars.y], axis=1) / (_TOGETHER * extent)).astype(int)
@@ -203,8 +199,8 @@ def seen_from(
     stars: StarResiduals,
     group: Int[np.ndarray, " r"],
     members: Float[np.ndarray, "k c"],
-    residual: Float[np.ndarray, "r k"],
-    variance: Float[np.ndarray, " s"],
+    residual: Residuals,
+    variance: OfStars,
 ) -> Iterator[Seen]:
     """The stars by their rows of each exposure group and of all that follow it; `members` as in `_sums`."""
     first, sums = stars.first, _sums(stars, residual, members)
@@ -244,7 +240,7 @@ def strongest(seen: Seen, extent: float) -> Strongest:
 
 
 def _smoothed(
-    index: Int[np.ndarray, " s"], values: Float[np.ndarray, " s"], shape: tuple[int, ...], power: int
+    index: Int[np.ndarray, " s"], values: OfStars, shape: tuple[int, ...], power: int
 ) -> Float[np.ndarray, " c"]:
     """Sums of values over cells with the weights g (`power` 1) or g² (2)."""
     reach = _CELLS * int(REACH)
@@ -298,7 +294,7 @@ def described(seen: Seen, camera: int, place: Place, size: float) -> Bool[np.nda
     return (shift != 0) & (np.abs(seen.z[:, camera] - shift) < CUT + 0.5 * np.abs(shift))
 
 
-def share_of(seen: Seen, camera: int, g: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
+def share_of(seen: Seen, camera: int, g: OfStars) -> tuple[float, float, float]:
     """β of a camera, its standard error, and by how much it makes χ² smaller."""
     shape = seen.alpha[:, camera] * g
     square, score = float(shape @ shape), float(shape @ seen.z[:, camera])

@@ -44,10 +44,7 @@ class Polarisation(NamedTuple):
 def polarisation(
     qu: Float[np.ndarray, "s 2"], covariance: Float[np.ndarray, "s 2 2"], estimator: str = "MAS"
 ) -> Polarisation:
-    """Degree and angle of polarisation of stars; NaN stays NaN.
-
-    Raises ValueError for an estimator that is none of `ESTIMATORS`.
-    """
+    """Degree and angle of polarisation of stars; NaN stays NaN. Raises ValueError for an unknown estimator."""
     if estimator not in ESTIMATORS:
         raise ValueError(f"there is no estimator {estimator!r}: choose {' or '.join(ESTIMATORS)}")
     q, u = qu.T

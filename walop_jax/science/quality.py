@@ -142,10 +142,7 @@ def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
 def quality_row(
     calibration: Calibration, run: str, accuracy: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """The quality numbers of a calibration; `accuracy` is `accuracy_of_p` of its summary, if there is one.
-
-    Exposures of several nights are those of the last one.
-    """
+    """Quality numbers of a calibration, of its last night; `accuracy`: `accuracy_of_p` of its summary, if any."""
     exposures, verdict = calibration.exposures, calibration.verdict
     if accuracy is None:
         field = field_accuracy(calibration)
@@ -173,9 +170,6 @@ def quality_row(
         "HIDDEN": hidden,
         **{f"{GAIN}_{name.upper()}": float(gain) for name, gain in gains},
     }
-
-
-# ---------------------------------------------------------------------------------------------- the table of nights
 
 
 def read_limits(path: str | os.PathLike[str] | None = None) -> Limits:

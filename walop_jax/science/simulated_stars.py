@@ -44,15 +44,13 @@ class SimulatedStars:
         """The truth as plain data."""
         return {"q": self.qu[:, 0].tolist(), "u": self.qu[:, 1].tolist(), "teff": self.teff.tolist()}
 
-    def of_camera(
-        self, number: int, seed: int, pointing: Pointing = POINTING
-    ) -> tuple[Columns, dict[str, Any]]:
+    def of_camera(self, number: int, seed: int) -> tuple[Columns, dict[str, Any]]:
         """Columns of one camera, named as by SExtractor, in an order and with positions of its own; its header."""
         columns = {name: values for name, (values, *_) in self.columns.items()}
         draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5, number)))
         rows = draw.permutation(len(self.teff))
         off_ra, off_dec = _POSITION_ERROR / 3600.0 * draw.standard_normal((2, len(rows)))
-        header = {"RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
+        header = {"RA": POINTING.ra, "DEC": POINTING.dec, "ROTATOR": POINTING.rotator}
         header |= {name: columns[name][0].item() for name in ("FILTER", "MJD")}
         dec = columns["DEC"][rows]
         made: Columns = {
@@ -75,7 +73,6 @@ def simulated_stars(
     *,
     night: int = 0,
     noiseless: bool = False,
-    pointing: Pointing = POINTING,
 ) -> SimulatedStars:
     """Stars over the field of a plan, dwarfs and giants alike, seen once by an instrument in the plan's first filter.
 
@@ -86,7 +83,7 @@ def simulated_stars(
     draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4, 0)))
     photons = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4, 1 + night)))
     x, y = draw.uniform(-field, field, (2, count))
-    ra, dec = pointing.sky_of(x, y)
+    ra, dec = POINTING.sky_of(x, y)
     degree, angle = draw.uniform(0.0, _DEGREE, count), draw.uniform(0.0, 2.0 * np.pi, count)
     qu = np.stack([degree * np.cos(angle), degree * np.sin(angle)], axis=1)
     colour = np.clip(draw.normal(*_COLOUR, count), *LIMITS)
@@ -95,7 +92,7 @@ def simulated_stars(
     teff = teff + _SCATTER * draw.standard_normal(count)
     flux = 4.0 * 10.0 ** draw.uniform(np.log10(ELECTRONS[0]), np.log10(ELECTRONS[1]), count)
 
-    rotator = pointing.rotator_at(ra, dec)
+    rotator = POINTING.rotator_at(ra, dec)
     stokes = np.stack([np.ones(count), *sky_to_instrument(qu[:, 0], qu[:, 1], rotator)], axis=1)
     nodes = np.append(np.nan, colour_nodes(COLOURS))
     settings = dataclasses.replace(Settings.default(len(nodes), curve.name), teff=nodes)
@@ -104,9 +101,8 @@ def simulated_stars(
     expected = flux[:, None] * np.einsum("pc,pcks,ps->pk", colour_weights(teff, COLOURS), vectors, stokes)
     if not light.is_linear(instrument):
         single = jax.tree.map(lambda leaf: leaf[:1], layout.exposures)
-        expected = np.asarray(
-            jax.vmap(lambda n: light.detected(instrument, single, n[None])[0])(array(expected))
-        )
+        detected = jax.vmap(lambda n: light.detected(instrument, single, n[None])[0])
+        expected = np.asarray(detected(array(expected)))
     noise = PhotonNoise(plan.read_noise)
     counts, sigma = (expected, noise.sigma(expected)) if noiseless else noise.draw(photons, expected)
     columns: Columns = {

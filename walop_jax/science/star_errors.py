@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.thresholds import GOAL
 from walop_jax.data.settings import Settings
 from walop_jax.science.estimate import estimate
 
@@ -24,6 +24,7 @@ _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 Vectors = Float[np.ndarray, "p *r k 3"]
 """Analysis vectors at field points, of one exposure or of several (r) in which a star is seen."""
 QuPairs = Float[np.ndarray, "n 2"]
+Places = Float[np.ndarray, " p"]  # at field points
 CameraPairs = tuple[tuple[int, int], ...]
 
 
@@ -36,8 +37,8 @@ def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k
 class Truth(NamedTuple):
     """True instrument matrices (m21, m22, …) at field positions (deg), for the colour of the polariser's source."""
 
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
+    x: Places
+    y: Places
     matrix: Float[np.ndarray, "p m"]
 
 
@@ -61,11 +62,7 @@ def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, 
 
 
 def promised_errors(
-    analysis: AnalysisVectors,
-    setting: Settings,
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-    stars: Float[np.ndarray, "n 2"],
+    analysis: AnalysisVectors, setting: Settings, x: Places, y: Places, stars: Float[np.ndarray, "n 2"]
 ) -> Errors:
     """Errors that the covariance of the calibration promises, rms over the stars."""
     vectors = analysis.coloured(setting, x, y)
@@ -85,12 +82,7 @@ def promised_errors(
     return np.sqrt(total / n)
 
 
-def plate_errors(
-    analysis: AnalysisVectors,
-    settings: Sequence[Settings],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-) -> Float[np.ndarray, " p"]:
+def plate_errors(analysis: AnalysisVectors, settings: Sequence[Settings], x: Places, y: Places) -> Places:
     """Photon error of (q, u) in the worse direction for an unpolarised star seen once through each setting.
 
     In units of the error of q that an ideal instrument would have with the same light: 1 for a single exposure of
@@ -100,15 +92,14 @@ def plate_errors(
     rows = np.stack([analysis.exact(s, x, y)[:, 0] for s in settings], axis=1)
     counts = _ELECTRONS * rows[..., 0]
     expected, star = counts.reshape(n * r, -1), np.repeat(np.arange(n), r)
-    stokes = estimate(
-        rows.reshape(n * r, -1, 3), expected, np.sqrt(expected), star, analysis.instrument.cameras
-    )
+    flat, cameras = rows.reshape(n * r, -1, 3), analysis.instrument.cameras
+    stokes = estimate(flat, expected, np.sqrt(expected), star, cameras)
     worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(stokes.photon, nan=np.inf))[:, 1])
     # q from a normalised difference with half of the electrons: σ² = 2 / all electrons.
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
 
-def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Float[np.ndarray, " p"]:
+def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Places:
     """Information of the exposures on (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
 
     In general the root of det MᵀM, M having a row (m22, m23) for every arm and exposure: 0 where all see the same
@@ -142,8 +133,8 @@ def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> 
 class MethodErrors:
     """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
 
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
+    x: Places
+    y: Places
     paper: Errors
     joint: Errors
     zone: Bool[np.ndarray, " p"]

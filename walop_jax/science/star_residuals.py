@@ -47,6 +47,8 @@ SINGULAR = 1e-10
 """Share of the largest eigenvalue below which stars do not measure a direction of the fitted numbers."""
 ROUNDING = 1e-12
 """Share of its square that a column must have once flux, q and u are fitted: less is rounding, of either sign."""
+Residuals = Float[np.ndarray, "r k"]  # a number for each row and camera
+OfStars = Float[np.ndarray, " s"]  # one for each star
 Matrix = Float[np.ndarray, "c c"]
 
 
@@ -63,11 +65,11 @@ class StarResiduals:
     """
 
     star: Int[np.ndarray, " r"]
-    residual: Float[np.ndarray, "r k"]
-    model: Float[np.ndarray, "r k"]
+    residual: Residuals
+    model: Residuals
     tangent: Float[np.ndarray, "r 2 k"]
     photon: Float[np.ndarray, "s 2 2"]
-    root: Float[np.ndarray, "r k"]
+    root: Residuals
     x: Float[np.ndarray, " r"]
     y: Float[np.ndarray, " r"]
     time: Float[np.ndarray, " r"]
@@ -111,7 +113,7 @@ class StarResiduals:
         fluxes = ((used @ (arms > 0).T) > 0).sum(axis=1)
         return np.add.reduceat(used.sum(axis=1) - fluxes, self.first) - 2
 
-    def chi2(self, residual: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " s"]:
+    def chi2(self, residual: Residuals) -> OfStars:
         """χ² of every star: the sum of its squared residuals."""
         return np.add.reduceat(np.sum(residual**2, axis=1), self.first)
 
@@ -125,9 +127,8 @@ class StarResiduals:
             for f in dataclasses.fields(self)
             if f.name not in ("star", "photon", "together", "structure")
         }
-        return StarResiduals(
-            star=self.star[rows] - start, photon=self.photon[stars], together=self.together, **cut
-        )
+        cut |= {"star": self.star[rows] - start, "photon": self.photon[stars]}
+        return StarResiduals(together=self.together, **cut)
 
     def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
         """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with its part."""
@@ -152,24 +153,19 @@ class StarResiduals:
         along = np.einsum("rik,crk->ric", self.tangent, free, optimize=True)
         return free, np.add.reduceat(along, self.first)
 
-    def left(self, change: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+    def left(self, change: Residuals) -> Residuals:
         """P c of one change of the counts over σ."""
         free, along = self.projected(change[..., None])
         moved = np.einsum("sij,sjc->sic", self.photon, along)[self.star, :, 0]
         return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
 
-    def behind(
-        self,
-        residual: Float[np.ndarray, "r k"],
-        change: Callable[[StarResiduals, slice], Float[np.ndarray, "r k"]],
-    ) -> Float[np.ndarray, "r k"]:
+    def behind(self, residual: Residuals, change: Callable[[StarResiduals, slice], Residuals]) -> Residuals:
         """Residuals behind a change of the counts over σ, which `change` gives for some stars and their rows."""
-        return np.concatenate(
-            [residual[rows] - subset.left(change(subset, rows)) for _, rows, subset in self.blocks()]
-        )
+        remaining = (residual[rows] - part.left(change(part, rows)) for _, rows, part in self.blocks())
+        return np.concatenate(list(remaining))
 
 
-def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
+def own_variance(stars: StarResiduals) -> OfStars:
     """Variance of residuals over that of noise: unknown colours and structure of the field add to it."""
     spread = np.zeros(len(stars.photon))
     columns = [stars.colour[..., n] for n in range(stars.colour.shape[-1])] if stars.colour.any() else []
@@ -184,8 +180,8 @@ def own_variance(stars: StarResiduals) -> Float[np.ndarray, " s"]:
 class Weights(NamedTuple):
     """Weights of stars: `inverse` is 1/variance of the residuals, 0 for those left out, `share` is κ."""
 
-    inverse: Float[np.ndarray, " s"]
-    share: Float[np.ndarray, " s"]
+    inverse: OfStars
+    share: OfStars
 
 
 Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
@@ -193,7 +189,7 @@ Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
 
 
 def normal_matrix(
-    stars: StarResiduals, residual: Float[np.ndarray, "r k"], columns: Columns, weights: Weights
+    stars: StarResiduals, residual: Residuals, columns: Columns, weights: Weights
 ) -> tuple[Matrix, Float[np.ndarray, " c"]]:
     """Q and g (head of this file) of columns; `residual` is that of `stars`, with or without changes."""
     matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
@@ -236,10 +232,10 @@ class Scale(NamedTuple):
     value: float
     worth: float
     kept: Bool[np.ndarray, " s"]
-    share: Float[np.ndarray, " s"]
+    share: OfStars
 
 
-def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> Scale:
+def noise_scale(chi2: OfStars, dof: OfStars) -> Scale:
     """The factor by which χ² of stars exceeds its degrees of freedom, whatever a few of them do.
 
     From the median, then from all stars within the cut, until these stay the same. Stars without degrees of freedom
@@ -270,7 +266,7 @@ def noise_scale(chi2: Float[np.ndarray, " s"], dof: Float[np.ndarray, " s"]) -> 
     return Scale(scale, worth, selected, inside[of])
 
 
-def beside_fitted(scale: Scale, dof: Float[np.ndarray, " s"], fitted: float) -> Scale:
+def beside_fitted(scale: Scale, dof: OfStars, fitted: float) -> Scale:
     """The scale of χ² from which some fitted numbers have taken their part: of the degrees of freedom that are left."""
     number = float(dof[scale.kept].sum())
     share = max(1.0 - fitted / max(number, 1.0), 0.0)
@@ -295,9 +291,7 @@ def is_off(scale: Scale, alarm: float) -> bool:
     return scale.value > NO_NOISE and chance_of_scale(scale) < alarm
 
 
-def shared_by_rows(
-    stars: StarResiduals, residual: Float[np.ndarray, "r k"], variance: Float[np.ndarray, " s"]
-) -> Scale | None:
+def shared_by_rows(stars: StarResiduals, residual: Residuals, variance: OfStars) -> Scale | None:
     """The factor by which the common part of the rows of a star exceeds its expectation; None where all have one.
 
     T = Σ_k (Σ_j r_jk)² over cameras k and rows j has expectation tr I and variance 2 tr I², I the covariance of the

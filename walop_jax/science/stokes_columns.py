@@ -24,10 +24,7 @@ Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
 def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
-    """The columns added to a catalogue (docs: files); all rows of a star hold the result of the star.
-
-    Raises ValueError for an unknown `estimator` of the degree of polarisation.
-    """
+    """Columns added to a catalogue (docs: files), of stars in all their rows; ValueError for an unknown `estimator`."""
     covariance = stars.covariance
     light = polarisation(stars.qu, covariance, estimator)
     error = np.sqrt(np.einsum("sii->si", covariance))
@@ -36,6 +33,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     def pair(end: str, values: Float[np.ndarray, "s 2"], about: str) -> dict[str, tuple[np.ndarray, str]]:
         return {f"{name}{end}": (values[:, k], about.format(name)) for k, name in enumerate("QU")}
 
+    hidden = "largest shift of {} by a mistake that calibration data would not show"
     columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
@@ -49,9 +47,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
         **pair("_PHOTON", photon, "the share of the photons in {}_ERR"),
         **pair("_COLOUR", stars.colour, "error of {} if TEFF is ignored"),
-        **pair(
-            "_HIDDEN", stars.hidden, "largest shift of {} by a mistake that calibration data would not show"
-        ),
+        **pair("_HIDDEN", stars.hidden, hidden),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),
         "DOF": (stars.dof.astype(np.int32), "degrees of freedom of CHI2"),
         "NROWS": (stars.rows.astype(np.int32), "rows that were combined"),
@@ -84,14 +80,8 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
     }
 
 
-# ------------------------------------------------------------------------------------------------------- warnings
-
-
 def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
-    """Warnings about a catalogue: of its stars together, of counts and errors, of stars with another's rows.
-
-    `names` are those of the cameras.
-    """
+    """Warnings about a catalogue: all stars, counts and errors, rows of other stars; `names` are of the cameras."""
     at_places = {place.words() for place in stars.check.places}
     for text in stars.check.warnings():
         yield f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"

@@ -58,6 +58,7 @@ from walop_jax.science.star_residuals import (
     ROUNDING,
     SINGULAR,
     TRIMMED,
+    Residuals,
     Scale,
     StarResiduals,
     Weights,
@@ -76,16 +77,9 @@ WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen t
 MOST_GROUPS = 150
 """Exposure groups that are separated; neighbours of more are joined."""
 RIVALS = (
-    "hwp1_axis",
-    "hwp2_axis",
-    "hwp1_crossing",
-    "hwp2_crossing",
-    "chwp_axis",
-    "wollaston_axis",
-    "upstream_retarder",
-    "telescope_polarisation",
-    "filter_shift",
-)
+    "hwp1_axis", "hwp2_axis", "hwp1_crossing", "hwp2_crossing", "chwp_axis", "wollaston_axis", "upstream_retarder",
+    "telescope_polarisation", "filter_shift",
+)  # fmt: skip
 """Effects of the optics that may have changed, beside the parameters of the model."""
 EDGES = (2.0, 8.0)
 """Sharpness of spots: a blurred one and one with an edge."""
@@ -135,16 +129,12 @@ def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[C
             name = names[number] if number < len(names) else f"catalogue {number + 1}"
             rows = f"{np.sum(~timed) if timed.any() else 'all'} of {len(timed)} rows have no time"
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as their times are unknown")
-    return [c.of_rows(timed) for c, timed in zip(catalogues, has_time, strict=True) if timed.any()], tuple(
-        remarks
-    )
+    timed_rows = zip(catalogues, has_time, strict=True)
+    return [c.of_rows(timed) for c, timed in timed_rows if timed.any()], tuple(remarks)
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
-    """The calibration with those of `RIVALS` that its instrument may have, at neutral and as good as certain.
-
-    They are columns that a change of the optics may have, beside the parameters that were fitted.
-    """
+    """The calibration with the `RIVALS` that its instrument may have, as columns: at neutral, as good as certain."""
     context = effect_context(calibration.model.template, calibration.exposures)
     model = calibration.model
     for name in RIVALS:
@@ -173,7 +163,9 @@ def grouped(
     return times, group.reshape(-1)
 
 
-Settled = tuple[WatchedChange, Float[np.ndarray, "r k"]]
+Matrix = Float[np.ndarray, "c c"]
+Score = Float[np.ndarray, " c"]
+Settled = tuple[WatchedChange, Residuals]
 """A change, and the residuals behind it."""
 
 
@@ -205,7 +197,7 @@ class Watching:
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def weights(self, residual: Float[np.ndarray, "r k"]) -> tuple[Weights, Scale]:
+    def weights(self, residual: Residuals) -> tuple[Weights, Scale]:
         """Weights of the stars, and the scale of all of them.
 
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
@@ -222,9 +214,7 @@ class Watching:
                 weights, _, off = rescaled
         return weights, scale
 
-    def _scaled(
-        self, residual: Float[np.ndarray, "r k"], fitted: Float[np.ndarray, " g"]
-    ) -> tuple[Weights, Scale, bool]:
+    def _scaled(self, residual: Residuals, fitted: Float[np.ndarray, " g"]) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
@@ -248,8 +238,8 @@ class Watching:
         return Weights(weight / self.variance, share), overall, several
 
     def _behind_gains(
-        self, residual: Float[np.ndarray, "r k"], weights: Weights, count: int
-    ) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, " g"]]:
+        self, residual: Residuals, weights: Weights, count: int
+    ) -> tuple[Residuals, Float[np.ndarray, " g"]]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
@@ -259,16 +249,14 @@ class Watching:
             size[g] = root @ (root.T @ slopes[g, :count])
             fitted[g] = root.shape[1]
 
-        def change(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k"]:
+        def change(part: StarResiduals, rows: slice) -> Residuals:
             return np.einsum("rkc,rc->rk", self.readings.columns(part)[..., :count], size[self.group[rows]])
 
         return self.stars.behind(residual, change), fitted
 
     # -------------------------------------------------------------------------------------------- columns
 
-    def scan(
-        self, residual: Float[np.ndarray, "r k"], weights: Weights
-    ) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+    def scan(self, residual: Residuals, weights: Weights) -> tuple[Matrix, Score]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
         nuisances = self.root.shape[1] + 2
@@ -336,7 +324,7 @@ class Watching:
             blocks -= (flat.T @ flat).reshape(blocks.shape)
 
     def _by_group(
-        self, matrix: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"]
+        self, matrix: Matrix, score: Score
     ) -> tuple[Float[np.ndarray, "g k g k"], Float[np.ndarray, "g k"]]:
         """Q and g of `scan` by group and change."""
         slopes = score.reshape(len(self.time), -1)
@@ -346,22 +334,26 @@ class Watching:
         return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
 
     def suspects(self, found: Answers) -> list[PossibleChange]:
-        """Every reading with the histories compared, the most significant first; those too large for theirs last."""
+        """Readings with the best history of each kind and its neighbours, the strongest first, too large ones last."""
+        strength = np.max(np.abs(found.size / found.error), axis=1)
+        compared: list[int] = []
+        for kind in ("step", "drift", "once"):
+            if mine := [n for n, h in enumerate(self.histories) if h.kind == kind]:
+                top = max(mine, key=lambda n: strength[n])
+                compared += [n for n in (top - 1, top, top + 1) if n in mine]
         listed = [
             PossibleChange(
                 reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
                 float(found.error[n, k]), reading.unit, reading.kind,
                 () if reading.across is None else (float(found.angle[n, k]),),
             )
-            for n in self.near(found.size / found.error)
+            for n in compared
             for k, reading in enumerate(self.readings.listed)
             if np.isfinite(found.error[n, k])
         ]  # fmt: skip
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
-    def without(
-        self, residual: Float[np.ndarray, "r k"], change: PossibleChange, size: float
-    ) -> Float[np.ndarray, "r k"]:
+    def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
         return self.stars.behind(
@@ -389,21 +381,19 @@ class Watching:
                 self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
-        remarks = self.alone(residual, weights, scale)
-        return dataclasses.replace(self.told(changes, matrix, score, scale), remarks=remarks)
-
-    def alone(self, residual: Float[np.ndarray, "r k"], weights: Weights, whole: Scale) -> tuple[str, ...]:
-        """A remark on stars that were left out as they disagree by more than noise ever does."""
+        result = self.told(changes, matrix, score, scale)
+        # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
-        chi2 = self.stars.chi2(residual) / (self.variance * max(whole.value, 1.0))
+        chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
         odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
         if not odd.any():
-            return ()
+            return result
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
-        return (
+        remark = (
             f"{odd.sum()} of {len(dof)} stars disagree with the calibration each by itself and were left out, the "
-            f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?",
+            f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?"
         )
+        return dataclasses.replace(result, remarks=(remark,))
 
     def _likeliest(self, ways: list[Settled]) -> Settled | None:
         """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
@@ -425,7 +415,7 @@ class Watching:
         """Every history of every reading, each alone."""
         return self.readings.answers(*self._by_group(matrix, score), self.shapes)
 
-    def settled(self, residual: Float[np.ndarray, "r k"], answers: Answers) -> Settled:
+    def settled(self, residual: Residuals, answers: Answers) -> Settled:
         """A change with its rivals, and the residuals behind it.
 
         Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
@@ -463,7 +453,7 @@ class Watching:
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return WatchedChange(best, tuple(alike), *when)
 
-    def spotted(self, residual: Float[np.ndarray, "r k"], weights: Weights) -> Settled | None:
+    def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
         # Stars that lie off may be those of the spot.
         common = np.zeros(len(self.time) + 1)
@@ -509,7 +499,7 @@ class Watching:
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self, residual: Float[np.ndarray, "r k"], asked: list[PossibleChange], weights: Weights
+        self, residual: Residuals, asked: list[PossibleChange], weights: Weights
     ) -> list[PossibleChange]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
@@ -532,25 +522,7 @@ class Watching:
         ]
         return sorted(sizes, key=lambda entry: -abs(entry.sigma))
 
-    def near(self, z: Float[np.ndarray, "h c"]) -> list[int]:
-        """The best history of each kind, whatever has changed, and its neighbours in time."""
-        strength = np.max(np.abs(z), axis=1)
-        chosen: list[int] = []
-        for kind in ("step", "drift", "once"):
-            mine = [n for n, h in enumerate(self.histories) if h.kind == kind]
-            if not mine:
-                continue
-            top = max(mine, key=lambda n: strength[n])
-            chosen += [n for n in (top - 1, top, top + 1) if n in mine]
-        return chosen
-
-    def told(
-        self,
-        changes: list[WatchedChange],
-        matrix: Float[np.ndarray, "c c"],
-        score: Float[np.ndarray, " c"],
-        whole: Scale,
-    ) -> Watch:
+    def told(self, changes: list[WatchedChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
         """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
@@ -566,15 +538,12 @@ class Watching:
                 gain[:, k] += 0.0 if mine is None else mine.size * mine.history.over(self.time)
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
-            smallest[:, k] = (self.alarm + MOST_LIKELY) * np.where(
-                information > 0, information, np.nan
-            ) ** -0.5
-        chi2 = self.stars.chi2(self.stars.residual)
-        dof = self.stars.dof
-        pairs = np.unique(self.stars.star * groups + self.group)
-        ratio = np.full(groups, np.nan)
+            measured = np.where(information > 0, information, np.nan)
+            smallest[:, k] = (self.alarm + MOST_LIKELY) * measured**-0.5
+        chi2, dof = self.stars.chi2(self.stars.residual), self.stars.dof.astype(float)
+        pairs, ratio = np.unique(self.stars.star * groups + self.group), np.full(groups, np.nan)
         for g in np.unique(self.pool[self.pool < groups]):
-            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g].astype(float)).value
+            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g]).value
         return Watch(
             cameras=self.cameras,
             time=self.time,

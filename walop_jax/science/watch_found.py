@@ -103,24 +103,14 @@ class Watch(Displayed):
             return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
         entries = [
-            {
-                "camera": c.camera,
-                "time": c.time,
-                "between": list(c.between),
-                "best": plain(c.best),
-                "alike": [plain(e) for e in c.alike],
-            }
+            {"camera": c.camera, "time": c.time, "between": list(c.between)}
+            | {"best": plain(c.best), "alike": [plain(e) for e in c.alike]}
             for c in self.changes
         ]
+        of_cameras = {"gain": self.gain, "error": self.error, "smallest_step_seen": self.smallest}
         groups = [
-            {
-                "time": float(self.time[g]),
-                "stars": int(self.stars[g]),
-                "chi2_per_dof": float(self.chi2[g]),
-                "gain": dict(zip(self.cameras, self.gain[g].tolist(), strict=True)),
-                "error": dict(zip(self.cameras, self.error[g].tolist(), strict=True)),
-                "smallest_step_seen": dict(zip(self.cameras, self.smallest[g].tolist(), strict=True)),
-            }
+            {"time": float(self.time[g]), "stars": int(self.stars[g]), "chi2_per_dof": float(self.chi2[g])}
+            | {key: dict(zip(self.cameras, v[g].tolist(), strict=True)) for key, v in of_cameras.items()}
             for g in range(len(self.time))
         ]
         return {
@@ -151,36 +141,20 @@ class Watch(Displayed):
 
     def display(self) -> Display:
         """The verdict, the changes, the smallest step seen, and the groups."""
-        percent = 100.0
-        rows = tuple(
-            (
-                f"{self.time[g]:.4f}" if self.time[g] > FIRST_DATE else f"{self.time[g]:g}",
-                f"{self.stars[g]}",
-                f"{self.chi2[g]:.2f}",
-                *(
-                    with_minus_sign(f"{percent * self.gain[g, k]:+.3f}")
-                    + f" ± {percent * self.error[g, k]:.3f}"
-                    for k in range(len(self.cameras))
-                ),
-                f"{percent * self.smallest[g].min():.2g}",
-            )
-            for g in range(len(self.time))
-        )
-        smallest = two_digits(percent * float(np.min(self.smallest)))
-        return Display(
-            title="The calibration is still valid"
-            if self.holds
-            else "The calibration IS NO LONGER VALID"
-            if self.changes
-            else "The stars DO NOT SHOW whether the calibration is still valid",
-            facts=(
-                ("exposure groups", f"{len(self.time)}"),
-                ("sensitivity", f"a {smallest} % step in one camera would be detected (99 % probability)"),
-            ),
-            head=(
-                "MJD" if np.min(self.time) > FIRST_DATE else "group",
-                *(">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">sensitivity %"),
-            ),
-            rows=rows,
-            notes=self.warnings,
-        )
+        rows = []
+        for g, time in enumerate(self.time):
+            percent = zip(100.0 * self.gain[g], 100.0 * self.error[g], strict=True)
+            gains = [f"{with_minus_sign(f'{gain:+.3f}')} ± {error:.3f}" for gain, error in percent]
+            when = f"{time:.4f}" if time > FIRST_DATE else f"{time:g}"
+            seen = f"{100.0 * self.smallest[g].min():.2g}"
+            rows.append((when, f"{self.stars[g]}", f"{self.chi2[g]:.2f}", *gains, seen))
+        title = "The calibration is still valid"
+        if not self.holds:
+            unclear = "The stars DO NOT SHOW whether the calibration is still valid"
+            title = "The calibration IS NO LONGER VALID" if self.changes else unclear
+        smallest = two_digits(100.0 * float(np.min(self.smallest)))
+        sensitivity = f"a {smallest} % step in one camera would be detected (99 % probability)"
+        facts = (("exposure groups", f"{len(self.time)}"), ("sensitivity", sensitivity))
+        when = "MJD" if np.min(self.time) > FIRST_DATE else "group"
+        head = (when, ">stars", ">χ²/dof", *(f">{name} %" for name in self.cameras), ">sensitivity %")
+        return Display(title, facts, head, tuple(rows), self.warnings)

@@ -28,10 +28,7 @@ Sum = dict[int, float]
 
 
 class Reading(NamedTuple):
-    """A possible change, as a sum of `Readings.columns`; `across` is that along Y, of a gradient.
-
-    `widest` is the largest size that it may have.
-    """
+    """A possible change: a sum of `Readings.columns` (`across`: along Y, of a gradient), `widest` at most."""
 
     kind: str
     name: str
@@ -112,9 +109,8 @@ class Readings:
         return abs(change.size) <= (1.0 if change.kind == "spot" else self._of(change).widest)
 
     def _of(self, change: PossibleChange) -> Reading:
-        return next(
-            reading for reading in self.listed if (reading.kind, reading.name) == (change.kind, change.name)
-        )
+        thing = change.kind, change.name
+        return next(reading for reading in self.listed if (reading.kind, reading.name) == thing)
 
     def answers(
         self,

@@ -31,6 +31,7 @@ from walop_jax.model.effects.base import Context
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import check_names, unknown_name
+from walop_jax.model.specification import effect_context
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction
 
 NAN = float("nan")
@@ -421,16 +422,7 @@ class ObservingPlan:
 
     def context(self) -> Context:
         """The facts that effects which grow with the data need."""
-        exposures = self.exposures()
-        moon = np.flatnonzero(exposures.kind == "moon")
-        return Context(
-            exposures=len(exposures),
-            moon=tuple(int(i) for i in moon),
-            moon_ids=tuple(int(i) for i in exposures.exposure[moon]),
-            sources=self.star_names,
-            cameras=self.design.cameras.names,
-            units=self.design.units,
-        )
+        return effect_context(self.design, self.exposures())._replace(sources=self.star_names)
 
 
 def _square(edge: float, count: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:

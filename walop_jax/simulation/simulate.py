@@ -27,7 +27,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_orde
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.instrument import Instrument, adapted
-from walop_jax.model.parameters import leaves, unknown_name, values_of, with_values
+from walop_jax.model.parameters import Component, leaves, unknown_name, values_of, with_values
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, series_indices
@@ -61,7 +61,7 @@ class Simulated(NamedTuple):
         return f"{self.calset!r}\ntruth: {self.truth!r}"
 
 
-def truth_values(truth: Instrument) -> dict[str, float]:
+def truth_values(truth: Component) -> dict[str, float]:
     """The true value of every parameter by name; the names are those of a fit."""
     names = (leaf.name for leaf in leaves(truth))
     return {name: float(value) for name, value in zip(names, np.asarray(values_of(truth)), strict=True)}
@@ -136,9 +136,8 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     lmax = np.asarray(standards.lmax).copy()
     if plan.star_lmax:
         polarised = np.append(np.arange(n) - plan.unpolarised, np.full(len(names) - n, -1))
-        lmax = np.where(
-            polarised < 0, lmax, np.resize(plan.star_lmax, polarised.max(initial=0) + 1)[polarised]
-        )
+        in_turn = np.array(plan.star_lmax)[polarised % len(plan.star_lmax)]
+        lmax = np.where(polarised < 0, lmax, in_turn)
     return sources, dataclasses.replace(standards, q=array(true[0]), u=array(true[1]), lmax=array(lmax))
 
 
@@ -147,9 +146,8 @@ def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple
     rows = np.unique(catalogue.stars)[: len(plan.star_names)]
     sources = Sources(**{f.name: getattr(catalogue, f.name)[rows] for f in dataclasses.fields(catalogue)})
     standards = standards_of(sources, plan.exposures(), plan.curves())
-    true_values = dict(zip((leaf.name for leaf in leaves(true)), np.asarray(values_of(true)), strict=True))
-    values = zip((leaf.name for leaf in leaves(standards)), np.asarray(values_of(standards)), strict=True)
-    return sources, with_values(standards)(np.array([true_values.get(*pair) for pair in values]))
+    true_values, values = truth_values(true), truth_values(standards)
+    return sources, with_values(standards)(np.array([true_values.get(*pair) for pair in values.items()]))
 
 
 def _scattered(

@@ -88,13 +88,12 @@ class Layout:
         ) -> Examination:
             """With the columns of all exposures that were taken: the one before may be kept back."""
             columns = Columns(Likelihood.of(whole, result.model), result.values)
-            both = all_candidates(columns, hypotheses.names, hypotheses.sentences)
-            self.columns = {name: one.columns for some in both for name, one in some.items()}
-            named, told = (
-                {n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in some.items()}
-                for some in both
-            )
-            known = SimpleNamespace(candidates=named | told, is_like=lambda design: True)
+            asked = all_candidates(columns, [*hypotheses.names, *hypotheses.sentences])
+            self.columns = {name: one.columns for name, one in asked.items()}
+            inside = {
+                n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in asked.items()
+            }
+            known = SimpleNamespace(candidates=inside, is_like=lambda design: True)
             return examine(result, hypotheses, rng, known)  # type: ignore[arg-type]
 
         used = (one.intensities.block(0, len(one.points)).used for one in (fitted, whole))

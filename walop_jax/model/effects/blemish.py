@@ -66,12 +66,10 @@ class _Pattern:
 class Blemish(Effect):
     """A dark spot in front of one camera."""
 
-    x: Scalar = param(unit="deg", about="centre along X", source=SOURCE, scale=0.02, loose=1.0, default=0.0)
-    y: Scalar = param(unit="deg", about="centre along Y", source=SOURCE, scale=0.02, loose=1.0, default=0.0)
-    size: Scalar = param(
-        unit="deg", about="standard deviation of the spot", source=SOURCE, scale=0.02, loose=0.5, default=0.05
-    )
-    depth: Scalar = param(unit="", about="share that is missing", source=SOURCE, width=0.02, default=0.0)
+    x: Scalar = param("deg", "centre along X", SOURCE, scale=0.02, loose=1.0, default=0.0)
+    y: Scalar = param("deg", "centre along Y", SOURCE, scale=0.02, loose=1.0, default=0.0)
+    size: Scalar = param("deg", "standard deviation of the spot", SOURCE, scale=0.02, loose=0.5, default=0.05)
+    depth: Scalar = param("", "share that is missing", SOURCE, width=0.02, default=0.0)
     camera: int = eqx.field(static=True, default=0)
 
     name: ClassVar[str] = "blemish"

@@ -67,7 +67,7 @@ AMPLITUDES = {
 class Combinations(NamedTuple):
     """Factors of changes in a diagnosis: each pattern over the field with each form of dependence.
 
-    Patterns and forms are those of `diagnosis.dependences`; `among` is the group of changes tried together,
+    Patterns and forms are those of `diagnosis.grammar`; `among` is the group of changes tried together,
     each with its amplitude: single ones, those of the cameras of an arm, of all cameras or arms, or all optics there.
     """
 
@@ -351,10 +351,6 @@ class InExposures:
     def number(self) -> Any:
         """Positions in the list."""
         return np.arange(len(self.exposures.hours))
-
-    def of_kind(self, name: str) -> Any:
-        """True in exposures of a KIND."""
-        return self.exposures.of_kind(name)
 
     def angle(self, prefix: str) -> Any:
         """Angle (rad) of the polariser or of another moving element; NaN where it is out."""

@@ -1,7 +1,7 @@
 """Deviations of missing physics from its description, at the same places.
 
 Never a candidate: products of a diagnosis include them, with a covariance, where an addition has no name
-(`diagnosis.description_shape`). A fit of other data leaves them out.
+(`diagnosis.class_members`). A fit of other data leaves them out.
 
 Equation    M → M_Δ M_R M_D M of `optics`, each of the nine components of r, d, k being g Σ_p c_p f_p(x, y); other
             changes as in `change`
@@ -60,10 +60,10 @@ class Deviations(Effect):
     """Deviations from descriptions: any change of polarisation at some places, cubic over the field; other changes."""
 
     sizes: Float[Array, "a g p"] = param(
-        unit="", about="share, or retardance in rad", source=f"{SOURCE}; width: expected size", width=0.003
+        "", "share, or retardance in rad", f"{SOURCE}; width: expected size", width=0.003
     )
     amounts: Float[Array, " n"] = param(
-        unit="", about="amplitude of another change", source=f"{SOURCE}; width: that of its kind", width=1.0
+        "", "amplitude of another change", f"{SOURCE}; width: that of its kind", width=1.0
     )
     places: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)

@@ -45,12 +45,8 @@ def probed_gaps(units: Units) -> tuple[tuple[float, float], ...]:
 class Etalon(Effect):
     """Fringes of an air gap ahead of each half-wave plate."""
 
-    contrast: Scalar = param(
-        unit="", about="diattenuation at a maximum", source=SOURCE, width=0.003, default=0.0
-    )
-    gap: Scalar = param(
-        unit="um", about="thickness of the air gap", source=SOURCE, scale=0.05, loose=5.0, default=10.0
-    )
+    contrast: Scalar = param("", "diattenuation at a maximum", SOURCE, width=0.003, default=0.0)
+    gap: Scalar = param("um", "thickness of the air gap", SOURCE, scale=0.05, loose=5.0, default=10.0)
 
     name: ClassVar[str] = "etalon"
     reference: ClassVar[str] = SOURCE

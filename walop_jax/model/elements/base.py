@@ -57,7 +57,8 @@ class Element(Component):
                 result[members[0]] = element.mueller(ray)
                 continue
             axes = jnp.stack([cases[i][0].axis for i in members])
-            matrices = jax.vmap(_at_axis, (None, 0, None))(element, axes, ray)
+            turned = jax.vmap(lambda axis, e=element, r=ray: dataclasses.replace(e, axis=axis).mueller(r))
+            matrices = turned(axes)
             for place, i in enumerate(members):
                 result[i] = None if matrices is None else matrices[place]
         return result
@@ -89,10 +90,6 @@ class Element(Component):
         hundreds of times more weakly.
         """
         return ()
-
-
-def _at_axis(element: Any, axis: Float[Array, ""], ray: Ray) -> Mueller | None:
-    return dataclasses.replace(element, axis=axis).mueller(ray)
 
 
 def _turned_copies(cases: Sequence[tuple[Any, Ray]]) -> list[list[int]]:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import number
+from walop_jax.model.parameters import Scalar, number
 from walop_jax.model.ray import Ray, Real
 
 
@@ -70,18 +70,15 @@ def wedge_rotation(direction: tuple[Real, Real, Real], angle: Real, index: Real)
 
 # --------------------------------------------------------------------------------------------------------- the elements
 
-Scalar = Float[Array, ""]
 FRAMES = ("kept", "turned")
 
 
 class PupilMapping(Element):
     """From the field point to the direction of the collimated beam."""
 
-    magnification: Scalar = number(unit="", about="field-to-pupil magnification", default=1.0)
-    distortion: Scalar = number(unit="deg-2", about="cubic distortion")
-    aspect: Scalar | None = number(
-        unit="", about="magnification along Y over that along X, minus 1", default=None
-    )
+    magnification: Scalar = number("", "field-to-pupil magnification", default=1.0)
+    distortion: Scalar = number("deg-2", "cubic distortion")
+    aspect: Scalar | None = number("", "magnification along Y over that along X, minus 1", default=None)
 
     kind: ClassVar[str] = "pupil_mapping"
     reference: ClassVar[str] = "Maharana et al. 2022, Paper II, appendix B"
@@ -102,10 +99,8 @@ class Wedge(Element):
     It bends light along +X, or along `azimuth` from +X toward +Y.
     """
 
-    angle: Scalar = number(unit="rad", about="wedge angle")
-    azimuth: Scalar | None = number(
-        unit="deg", about="where it bends light to, from +X toward +Y", default=None
-    )
+    angle: Scalar = number("rad", "wedge angle")
+    azimuth: Scalar | None = number("deg", "where it bends light to, from +X toward +Y", default=None)
     material: str = eqx.field(static=True, default="BK7")
     frame: str = eqx.field(static=True, default=FRAMES[0])
     sense: float = eqx.field(static=True, default=1.0)

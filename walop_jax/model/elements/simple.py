@@ -19,7 +19,7 @@ from walop_jax.model import mueller
 from walop_jax.model.conventions import FIELD_SCALE, REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.elements.spectral import Curve, Scalar, WithCurves
-from walop_jax.model.parameters import number
+from walop_jax.model.parameters import number, row
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import ExposureArrays
 
@@ -27,10 +27,10 @@ from walop_jax.model.sources import ExposureArrays
 class Retarder(Element):
     """A linear retarder, the same over the field, with a retardance that may go as 1/λ."""
 
-    delta: Scalar = number(unit="rad", about="retardance")
-    axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
+    delta: Scalar = number("rad", "retardance")
+    axis: Scalar = number("deg", "fast axis, from +X toward +Y")
     wavelength: Scalar | None = number(
-        unit="um", about="wavelength of that retardance, which goes as 1/λ; none: achromatic", default=None
+        "um", "wavelength of that retardance, which goes as 1/λ; none: achromatic", default=None
     )
 
     kind: ClassVar[str] = "retarder"
@@ -57,8 +57,8 @@ class Rotator(Element):
     = 1/(2 N²) for an optic axis along Y and −1/(2 N²) along X, in a medium of index N.
     """
 
-    angle: Scalar = number(unit="deg", about="rotation, from +X toward +Y")
-    skew: Scalar = number(unit="", about="rotation (rad) of oblique rays, per unit of k_x k_y")
+    angle: Scalar = number("deg", "rotation, from +X toward +Y")
+    skew: Scalar = number("", "rotation (rad) of oblique rays, per unit of k_x k_y")
 
     kind: ClassVar[str] = "rotator"
     reference: ClassVar[str] = "Chipman, Lam & Young 2018, Polarized Light and Optical Systems, ch. 17"
@@ -71,9 +71,9 @@ class Rotator(Element):
 class Diattenuator(Element):
     """A linear diattenuator, the same over the field."""
 
-    q: Scalar = number(unit="", about="diattenuation along +X")
-    u: Scalar = number(unit="", about="diattenuation along +45°")
-    axis: Scalar = number(unit="deg", about="angle by which its axes are turned, from +X toward +Y")
+    q: Scalar = number("", "diattenuation along +X")
+    u: Scalar = number("", "diattenuation along +45°")
+    axis: Scalar = number("deg", "angle by which its axes are turned, from +X toward +Y")
 
     kind: ClassVar[str] = "diattenuator"
     reference: ClassVar[str] = "Lu & Chipman 1996, JOSA A 13, 1106"
@@ -88,8 +88,8 @@ class Diattenuator(Element):
 class Depolariser(Element):
     """Depolarisation: a share of the polarisation is lost, of the linear and of the circular part."""
 
-    linear: Scalar = number(unit="", about="share of q and u that is lost")
-    circular: Scalar = number(unit="", about="share of v that is lost")
+    linear: Scalar = number("", "share of q and u that is lost")
+    circular: Scalar = number("", "share of v that is lost")
 
     kind: ClassVar[str] = "depolariser"
     reference: ClassVar[str] = "Lu & Chipman 1996, JOSA A 13, 1106"
@@ -103,8 +103,8 @@ class Depolariser(Element):
 class AddedPolarisation(Element):
     """(0, q, u, 0) per unit of light is added, as by mirrors of a telescope to weakly polarised light."""
 
-    q: Scalar = number(unit="", about="polarisation added along +X")
-    u: Scalar = number(unit="", about="polarisation added along +45°")
+    q: Scalar = number("", "polarisation added along +X")
+    u: Scalar = number("", "polarisation added along +45°")
 
     kind: ClassVar[str] = "added_polarisation"
     reference: ClassVar[str] = "Patat & Taubenberger 2011, A&A 529, A57"
@@ -128,16 +128,14 @@ class AnalysisVector(Element):
     Limits      q² + u² + v² = 1: an ideal elliptical analyser; 0: a detector insensitive to polarisation
     """
 
-    q: Scalar = number(unit="", about="response to light polarised along +X")
-    u: Scalar = number(unit="", about="response to light polarised along +45°")
-    v: Scalar = number(unit="", about="response to circularly polarised light")
-    cos1: Curve | None = number(
-        unit="", about="change with cos φ of the response to I, Q, U, V", default=None, several=True
-    )
-    sin1: Curve | None = number(unit="", about="change with sin φ", default=None, several=True)
-    cos2: Curve | None = number(unit="", about="change with cos 2φ", default=None, several=True)
-    sin2: Curve | None = number(unit="", about="change with sin 2φ", default=None, several=True)
-    axis: Scalar = number(unit="deg", about="added to the angle that it follows")
+    q: Scalar = number("", "response to light polarised along +X")
+    u: Scalar = number("", "response to light polarised along +45°")
+    v: Scalar = number("", "response to circularly polarised light")
+    cos1: Curve | None = row("", "change with cos φ of the response to I, Q, U, V")
+    sin1: Curve | None = row("", "change with sin φ")
+    cos2: Curve | None = row("", "change with cos 2φ")
+    sin2: Curve | None = row("", "change with sin 2φ")
+    axis: Scalar = number("deg", "added to the angle that it follows")
 
     kind: ClassVar[str] = "analysis_vector"
     reference: ClassVar[str] = "Azzam 1985, Opt. Acta 32, 1407"
@@ -175,9 +173,9 @@ class Polariser(Element):
     Limits      ε = 0 is the ideal polariser. Its effect on the flux of polarised light is part of the unknown flux.
     """
 
-    extinction: Scalar = number(unit="", about="ε, unwanted over wanted transmission")
-    zero: Scalar | None = number(unit="deg", about="added to the encoder reading", default=None)
-    ellipticity: Scalar | None = number(unit="", about="circular polarisation behind it", default=None)
+    extinction: Scalar = number("", "ε, unwanted over wanted transmission")
+    zero: Scalar | None = number("deg", "added to the encoder reading", default=None)
+    ellipticity: Scalar | None = number("", "circular polarisation behind it", default=None)
     films: tuple[Any, ...] = ()  # layers behind it (`effects.optics.Film`)
 
     kind: ClassVar[str] = "polariser"
@@ -208,9 +206,9 @@ class Collimator(Element):
     Limits      nothing on the axis but (c_q, c_u)
     """
 
-    diattenuation: Scalar = number(unit="deg-2", about="c, radial diattenuation of curved lenses")
-    q: Scalar = number(unit="", about="c_q, constant part")
-    u: Scalar = number(unit="", about="c_u, constant part")
+    diattenuation: Scalar = number("deg-2", "c, radial diattenuation of curved lenses")
+    q: Scalar = number("", "c_q, constant part")
+    u: Scalar = number("", "c_u, constant part")
 
     kind: ClassVar[str] = "collimator"
     reference: ClassVar[str] = PAPER_II
@@ -232,11 +230,9 @@ class RadialRetarder(Element):
                 k (x² − y², 2xy)
     """
 
-    delta: Scalar = number(
-        unit="wave", about="retardance at the radius `scale`, 0.3° unless given (and 0.62 µm)"
-    )
-    slope: Scalar | None = number(unit="wave/um", about="change of it with wavelength", default=None)
-    bend: Scalar | None = number(unit="wave/um2", about="the same, per square of λ − 0.62 µm", default=None)
+    delta: Scalar = number("wave", "retardance at the radius `scale`, 0.3° unless given (and 0.62 µm)")
+    slope: Scalar | None = number("wave/um", "change of it with wavelength", default=None)
+    bend: Scalar | None = number("wave/um2", "the same, per square of λ − 0.62 µm", default=None)
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
 
     kind: ClassVar[str] = "radial_retarder"
@@ -274,20 +270,12 @@ class Analyser(WithCurves):
     first enters the band integral.
     """
 
-    efficiency: Scalar = number(unit="", about="η of the analysers ½(1, ±η, 0, 0)", default=1.0)
-    contrast: Scalar | None = number(
-        unit="", about="ξ, half the difference of the efficiencies", default=None
-    )
-    angle: Scalar | None = number(unit="deg", about="rotation of the analysers", default=None)
-    dispersion: Scalar | None = number(
-        unit="", about="κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None
-    )
-    balance: Curve | None = number(
-        unit="", about="half the relative difference of the beams at `balance_at`", default=None, several=True
-    )
-    loss: Curve | None = number(
-        unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
-    )
+    efficiency: Scalar = number("", "η of the analysers ½(1, ±η, 0, 0)", default=1.0)
+    contrast: Scalar | None = number("", "ξ, half the difference of the efficiencies", default=None)
+    angle: Scalar | None = number("deg", "rotation of the analysers", default=None)
+    dispersion: Scalar | None = number("", "κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None)
+    balance: Curve | None = row("", "half the relative difference of the beams at `balance_at`")
+    loss: Curve | None = row("", "share of the polarisation lost at `loss_at`")
     balance_at: tuple[float, ...] = eqx.field(static=True, default=())
     loss_at: tuple[float, ...] = eqx.field(static=True, default=())
     cameras: tuple[str, ...] = eqx.field(static=True, default=())

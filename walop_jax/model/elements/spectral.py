@@ -30,10 +30,9 @@ from jaxtyping import Array, Float
 from walop_jax.model import legendre, mueller
 from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.parameters import number
+from walop_jax.model.parameters import Scalar, number, row
 from walop_jax.model.ray import Ray
 
-Scalar = Float[Array, ""]
 Curve = Float[Array, " k"]
 FIELD_TERMS = {f"p{i}{j}": n for n, (i, j) in enumerate(legendre.terms(2))}
 
@@ -98,20 +97,12 @@ def _bends(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
 class SpectralElement(WithCurves):
     """A retarder, diattenuator and depolariser on one axis, each a smooth curve over wavelength."""
 
-    delta: Curve | None = number(unit="rad", about="retardance at `delta_at`", default=None, several=True)
-    diattenuation: Curve | None = number(
-        unit="", about="diattenuation along the axis at `diattenuation_at`", default=None, several=True
-    )
-    rotation: Curve | None = number(
-        unit="deg", about="turn of the polarisation at `rotation_at`", default=None, several=True
-    )
-    loss: Curve | None = number(
-        unit="", about="share of the polarisation lost at `loss_at`", default=None, several=True
-    )
-    spread: Curve | None = number(
-        unit="", about="share lost across the axis at `spread_at`", default=None, several=True
-    )
-    axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
+    delta: Curve | None = row("rad", "retardance at `delta_at`")
+    diattenuation: Curve | None = row("", "diattenuation along the axis at `diattenuation_at`")
+    rotation: Curve | None = row("deg", "turn of the polarisation at `rotation_at`")
+    loss: Curve | None = row("", "share of the polarisation lost at `loss_at`")
+    spread: Curve | None = row("", "share lost across the axis at `spread_at`")
+    axis: Scalar = number("deg", "fast axis, from +X toward +Y")
     delta_at: tuple[float, ...] = eqx.field(static=True, default=())
     diattenuation_at: tuple[float, ...] = eqx.field(static=True, default=())
     rotation_at: tuple[float, ...] = eqx.field(static=True, default=())
@@ -160,13 +151,13 @@ class FieldDiattenuator(Element):
     and hold the change with colour alone.
     """
 
-    p00: Curve | None = number(unit="", about="constant part at `at`", default=None, several=True)
-    p10: Curve | None = number(unit="", about="term P₁(x/h) at `at`", default=None, several=True)
-    p01: Curve | None = number(unit="", about="term P₁(y/h) at `at`", default=None, several=True)
-    p20: Curve | None = number(unit="", about="term P₂(x/h) at `at`", default=None, several=True)
-    p11: Curve | None = number(unit="", about="term P₁(x/h) P₁(y/h) at `at`", default=None, several=True)
-    p02: Curve | None = number(unit="", about="term P₂(y/h) at `at`", default=None, several=True)
-    axis: Scalar = number(unit="deg", about="axis, from +X toward +Y")
+    p00: Curve | None = row("", "constant part at `at`")
+    p10: Curve | None = row("", "term P₁(x/h) at `at`")
+    p01: Curve | None = row("", "term P₁(y/h) at `at`")
+    p20: Curve | None = row("", "term P₂(x/h) at `at`")
+    p11: Curve | None = row("", "term P₁(x/h) P₁(y/h) at `at`")
+    p02: Curve | None = row("", "term P₂(y/h) at `at`")
+    axis: Scalar = number("deg", "axis, from +X toward +Y")
     at: tuple[float, ...] = eqx.field(static=True, default=())
     none_at: float = eqx.field(static=True, default=0.0)  # µm; 0: nowhere
     scale: float = eqx.field(static=True, default=FIELD_SCALE)  # h, degrees
@@ -221,10 +212,10 @@ class Mirror(WithCurves):
                 arrives; k = 0 and tan θ = n (Brewster): light polarised along s alone; k → ∞: no diattenuation.
     """
 
-    n: Curve | None = number(unit="", about="index of refraction at `n_at`", default=None, several=True)
-    k: Curve | None = number(unit="", about="extinction coefficient at `k_at`", default=None, several=True)
-    incidence: Scalar = number(unit="deg", about="angle of incidence", default=45.0)
-    axis: Scalar = number(unit="deg", about="plane of incidence, from +X toward +Y")
+    n: Curve | None = row("", "index of refraction at `n_at`")
+    k: Curve | None = row("", "extinction coefficient at `k_at`")
+    incidence: Scalar = number("deg", "angle of incidence", default=45.0)
+    axis: Scalar = number("deg", "plane of incidence, from +X toward +Y")
     n_at: tuple[float, ...] = eqx.field(static=True, default=())
     k_at: tuple[float, ...] = eqx.field(static=True, default=())
 

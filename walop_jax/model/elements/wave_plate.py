@@ -29,10 +29,9 @@ from walop_jax.model.compiled import need_float64
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
-from walop_jax.model.parameters import Component, Parameter, number
+from walop_jax.model.parameters import Component, Parameter, Scalar, number
 from walop_jax.model.ray import Conditions, Ray, Real
 
-Scalar = Float[Array, ""]
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
 CROSSED = 1.5
@@ -56,12 +55,12 @@ class Layer(Component):
 
     name: str = eqx.field(static=True, default="")
     material: str = eqx.field(static=True, default="quartz")
-    thickness: Scalar = number(unit="um", about="thickness")
-    axis: Scalar = number(unit="deg", about="optic axis, from the fast axis of the plate")
-    cut: Scalar | None = number(unit="deg", about="optic axis out of the surface", default=None)
-    slope: Scalar | None = number(unit="um-1", about="dispersion: a of n_e − n_o", default=None)
-    bend: Scalar | None = number(unit="um-2", about="dispersion: b of n_e − n_o", default=None)
-    twist: Scalar | None = number(unit="um-3", about="dispersion: c of n_e − n_o", default=None)
+    thickness: Scalar = number("um", "thickness")
+    axis: Scalar = number("deg", "optic axis, from the fast axis of the plate")
+    cut: Scalar | None = number("deg", "optic axis out of the surface", default=None)
+    slope: Scalar | None = number("um-1", "dispersion: a of n_e − n_o", default=None)
+    bend: Scalar | None = number("um-2", "dispersion: b of n_e − n_o", default=None)
+    twist: Scalar | None = number("um-3", "dispersion: c of n_e − n_o", default=None)
     grown: tuple[Grown, ...] = ()
     declared: tuple[tuple[str, Parameter], ...] = eqx.field(static=True, default=())
 
@@ -87,8 +86,8 @@ class Layer(Component):
 class AirGap(Component):
     """An air gap ahead of a plate, with fringes of polarised light."""
 
-    contrast: Scalar = number(unit="", about="diattenuation at a maximum")
-    gap: Scalar = number(unit="um", about="thickness of the air")
+    contrast: Scalar = number("", "diattenuation at a maximum")
+    gap: Scalar = number("um", "thickness of the air")
     longest: float = eqx.field(static=True, default=0.0)  # µm: largest gap for the wavelength nodes
 
 
@@ -96,8 +95,8 @@ class WavePlate(Element):
     """Crystal layers in contact, in air, faces normal to the axis of the instrument."""
 
     layers: tuple[Layer, ...] = ()
-    axis: Scalar = number(unit="deg", about="fast axis, from +X toward +Y")
-    thermal: Scalar | None = number(unit="", about="thermal change, 1 as published", default=None)
+    axis: Scalar = number("deg", "fast axis, from +X toward +Y")
+    thermal: Scalar | None = number("", "thermal change, 1 as published", default=None)
     air_gaps: tuple[AirGap, ...] = ()
     grown: tuple[Grown, ...] = ()
     model: str = eqx.field(static=True, default="waves")
