@@ -10,6 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+# Workers share the cores: threads of linear algebra that wait for each other make the run half as long again.
+if "--benchmark" not in sys.argv:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import jax
 import pytest
 import shapes
 
@@ -19,9 +24,9 @@ if TYPE_CHECKING:
 
     from walop_jax.fit.refit import FitResult
 
-# Workers share the cores: threads of linear algebra that wait for each other make the run half as long again.
-if "--benchmark" not in sys.argv:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
+# Fixtures import what they need of the package: not the process that only hands out tests to workers.
+shapes.check_package()
 
 LEAST_COMPILED = 0.1  # seconds: what compiles faster is not worth a file
 # A quarter of the time; results differ by 10⁻¹³ of the counts. The last is newer than the oldest JAX that will do.
@@ -42,17 +47,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compute in float64, check shapes, compile quickly and little unless something is timed, in pytest's own cache.
+    """Compile quickly and little unless something is timed, and keep compiled code in pytest's own cache.
 
-    Workers and processes of tests share the cache, and so does the next run. The process that only hands out tests to
-    workers needs nothing of all this.
+    Workers and processes of tests share the cache, and so does the next run.
     """
-    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
-        return
-    import jax
-
-    jax.config.update("jax_enable_x64", True)  # the package itself never switches it on
-    shapes.check_package()
     if not config.getoption("--benchmark"):
         flags = (
             os.environ.get("XLA_FLAGS", ""),

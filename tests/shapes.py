@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
 import dataclasses
 import functools
 import inspect
 import types
 from collections.abc import Callable
-from typing import Annotated, Any, ForwardRef, get_args, get_origin
+from typing import Any, get_type_hints
 
 import jaxtyping
 from beartype import BeartypeConf, beartype
@@ -18,7 +17,7 @@ from beartype.roar import BeartypeDecorHintException
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
 _jaxtyped = jaxtyping.jaxtyped
 _TOGETHER = _jaxtyped("context")
-_RESOLVED: dict[tuple[str, str], Any] = {}
+_RESOLVED: dict[tuple[str, Any], Any] = {}
 
 
 def check_package() -> None:
@@ -70,16 +69,12 @@ def _comparing(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:
-    """An annotation without quotes; what only exists for pyright, or not yet, is Any."""
-    if not isinstance(annotation, str):
-        return annotation
+    """An annotation without quotes, also inside; what only exists for pyright, or not yet, is Any."""
     key = function.__module__, annotation
     if key not in _RESOLVED:
+        unread = types.SimpleNamespace(__annotations__={"hint": annotation})
         try:
-            hint = eval(annotation, function.__globals__, vars(builtins))
+            _RESOLVED[key] = get_type_hints(unread, function.__globals__)["hint"]
         except Exception:
             return Any
-        while get_origin(hint) is Annotated:
-            hint = get_args(hint)[0]
-        _RESOLVED[key] = Any if isinstance(hint, ForwardRef) else hint
     return _RESOLVED[key]
