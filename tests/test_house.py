@@ -196,7 +196,7 @@ MOST_LINES = {
     "model": 9494,
     "likelihood": 3305,
     "simulation": 1112,
-    "fit": 2055,
+    "fit": 2070,
     "calibration": 2655,
     "posterior": 2205,
     "science": 6110,
