@@ -30,7 +30,8 @@ Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool
@@ -64,6 +65,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
 TOGETHER = 1e8  # numbers in the columns of a batch of candidates
+MULTIPLIED = 4e6  # of those that are multiplied together: 32 MB
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
 UNEVEN = 1.25
@@ -150,19 +152,23 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
     normal = design.projector(normal).astype(np.float32)
-    scored, blocks, limit = list[Probe](), [], max(1, int(TOGETHER / len(residual)))
-    batch_of = np.cumsum([len(probe.widths) for probe in probes]) // limit
-    for number in np.unique(batch_of):
-        batch = [probe for probe, of in zip(probes, batch_of, strict=True) if of == number]
+    scored, blocks = list[Probe](), []
+    for batch in _in_groups(probes, TOGETHER / len(residual)):
         made = all_candidates(design.columns, [probe for probe in batch if probe.name not in known])
-        for probe in batch:
-            if probe.name in known or probe.name in made:
-                c = known.get(probe.name)
-                c = made[probe.name].columns.astype(float) / fit.noise_scale if c is None else c
-                along, square = basis[:count].T @ c, c.T @ c
-                drawn = c.T.astype(np.float32) @ normal[:count]
-                scored.append(probe)
-                blocks.append((np.diag(square), c.T @ residual[:count], drawn, square - along.T @ along))
+        shown = [probe for probe in batch if probe.name in known or probe.name in made]
+        for group in _in_groups(shown, MULTIPLIED / len(residual)):
+            columns = [
+                known[p.name] if p.name in known else made[p.name].columns.astype(float) / fit.noise_scale
+                for p in group
+            ]
+            joined = np.concatenate(columns, axis=1)
+            products = basis[:count].T @ joined, joined.T @ residual[:count]
+            drawn, last = joined.T.astype(np.float32) @ normal[:count], 0
+            for c in columns:
+                at = slice(last, last := last + c.shape[1])
+                square, along = c.T @ c, products[0][:, at]
+                blocks.append((np.diag(square), products[1][at], drawn[at], square - along.T @ along))
+        scored += shown
     if not scored:
         return ScoreTable((), noise, 1.0, 1.0)
     before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:3])
@@ -173,6 +179,13 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     )
     trials = effective_trials(space.smallest_of(drawn))
     return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
+
+
+def _in_groups(probes: Sequence[Probe], amplitudes: float) -> Iterator[list[Probe]]:
+    """Probes in their order, in groups of about so many amplitudes."""
+    group_of = np.cumsum([len(probe.widths) for probe in probes]) // max(1, int(amplitudes))
+    for _, group in itertools.groupby(zip(group_of.tolist(), probes, strict=True), lambda entry: entry[0]):
+        yield [probe for _, probe in group]
 
 
 def _of_pixels(result: FitResult) -> list[VarianceComponent]:
