@@ -11,16 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data import schema
-from walop_jax.data.checks import (
-    check_cameras,
-    doubts_about,
-    instrument_name,
-    make_exposures,
-    make_filters,
-    make_points,
-    make_sources,
-)
+from walop_jax.data import checks, schema
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.hdus import filter_columns
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
@@ -35,15 +26,6 @@ from walop_jax.data.records import (
     Points,
     Site,
     Sources,
-)
-from walop_jax.data.schema import (
-    CALVERS,
-    column_names,
-    in_unit,
-    read_table,
-    table_of,
-    table_rules,
-    without_mask,
 )
 from walop_jax.data.settings import builtin_filter
 from walop_jax.data.table_intensities import (
@@ -110,13 +92,13 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
         place = Place(path, name)
         if name in hdus:
-            columns = column_names(hdus[name], place)
+            columns = schema.column_names(hdus[name], place)
             # CLP and CHWP alone move, whatever else is there.
             if primary["CALVERS"] == 1 and name == "EXPOSURES":
                 turns = [f"{prefix}_TURN" for prefix in (POLARISER, CALIBRATION_PLATE)]
                 columns = [column for column in columns if column in {*schema.EXPOSURES, *turns}]
-            rules = table_rules(name, columns, place)
-            tables[name], odd = read_table(hdus[name], rules, place)
+            rules = schema.table_rules(name, columns, place)
+            tables[name], odd = schema.read_table(hdus[name], rules, place)
             remarks += odd
         elif name not in ("FILTERS", "SOURCES"):
             raise place.fail("the extension is missing", advice="see the file format")
@@ -153,20 +135,20 @@ def assembled(
     Raises `DataError` for whatever numbers cannot be meant.
     """
     remarks = list(remarks)
-    instrument = instrument_name(instrument, Place(path, "PRIMARY"))
-    filters = make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
+    instrument = checks.instrument_name(instrument, Place(path, "PRIMARY"))
+    filters = checks.make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
     place = Place(path, "EXPOSURES")
-    exposures = make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
-    remarks += doubts_about(instrument, site, exposures, place)
+    exposures = checks.make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
+    remarks += checks.doubts_about(instrument, site, exposures, place)
     sources = Sources.none()
     if "SOURCES" in tables:
-        sources = make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
+        sources = checks.make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
         intensities, points = _frames(images, exposures, instrument, path)
     else:
-        points = make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
+        points = checks.make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
-        check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
+        checks.check_cameras(instrument, tables["INTENSITIES"]["N"].shape[1], place, "N")
         intensities, odd = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks += odd + repeated
@@ -200,10 +182,10 @@ def _header(header: Any, path: Path) -> tuple[str, Site]:
         if "PRODVERS" in header:
             advice = "this is a calibration product of a fit: give the set that it was made from"
         raise place.fail("is missing", "CALVERS", advice)
-    if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= CALVERS:
-        what = f"is {version!r}, this program reads up to {CALVERS}"
+    if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= schema.CALVERS:
+        what = f"is {version!r}, this program reads up to {schema.CALVERS}"
         raise place.fail(what, "CALVERS", "use a newer walop-jax")
-    instrument = instrument_name(header.get("INSTRUME", ""), place)
+    instrument = checks.instrument_name(header.get("INSTRUME", ""), place)
     values: list[float] = []
     for name in ("SITELAT", "SITELONG", "SITEELEV"):
         value = header.get(name, _NAN)
@@ -244,11 +226,11 @@ def _frames(
         advice = "give standards in a table, in another file"
         raise Place(path, "EXPOSURES").fail(what, "KIND", advice)
     grid, stack = frame_stack(images, len(exposures), path)
-    check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
+    checks.check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
     width, total = grid.width, grid.pixels
     corners = [grid.xy(n, n + 1) for n in (0, width - 1, total - width, total - 1)]
     x, y = (np.concatenate(coordinates) for coordinates in zip(*corners, strict=True))
-    make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
+    checks.make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
     intensities = FrameIntensities(grid, (stack,))
     place, last = Place(path, "N0"), intensities.cameras - 1
     sampled = [int(row) for row in np.unique(np.linspace(0, grid.height - 1, _SAMPLE).astype(int))]
@@ -314,8 +296,13 @@ def from_arrays(
     array([ 0., 30., 60., 90.])
     """
     check_units({"counts": unit_of(counts), "errors": unit_of(errors)}, "electron", Place(NAME, ""))
-    counts, errors = in_unit(counts, "electron", "counts"), in_unit(errors, "electron", "errors")
-    x, y, angles = (np.atleast_1d(in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles")))
+    counts, errors = (
+        schema.in_unit(counts, "electron", "counts"),
+        schema.in_unit(errors, "electron", "errors"),
+    )
+    x, y, angles = (
+        np.atleast_1d(schema.in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles"))
+    )
     if counts.ndim != 3 or counts.shape[:2] != (len(x), len(angles)) or len(x) != len(y):
         what = f"has shape {counts.shape} for {len(x)} values of x, {len(y)} of y and {len(angles)} angles"
         raise fail(what, column="counts", advice="its axes are (point, exposure, camera)")
@@ -327,7 +314,7 @@ def from_arrays(
         raise fail(f"has shape {errors.shape}, counts {counts.shape}", column="errors", advice="one for each")
     number, inside = len(angles), np.isfinite(angles)
     at = point, exposure = np.nonzero(np.isfinite(counts).all(axis=2))
-    of_star, masked = without_mask(np.full(counts.shape[:2], -1) if source is None else source)
+    of_star, masked = schema.without_mask(np.full(counts.shape[:2], -1) if source is None else source)
     tables: dict[str, Mapping[str, Any]] = {
         "EXPOSURES": {
             "EXPOSURE": np.arange(number),
@@ -346,7 +333,7 @@ def from_arrays(
         },
     }
     if sky is not None:
-        level = np.broadcast_to(in_unit(sky, "electron", "sky"), counts.shape)
+        level = np.broadcast_to(schema.in_unit(sky, "electron", "sky"), counts.shape)
         tables["INTENSITIES"] = {**tables["INTENSITIES"], "SKY": level[at]}
     if sources is not None:
         tables["SOURCES"] = _sources(sources)
@@ -373,7 +360,7 @@ def _in_memory(tables: Mapping[str, Mapping[str, Any]], **header: Any) -> Calibr
     filled = {}
     for name, columns in tables.items():
         place = Place(NAME, name)
-        filled[name] = table_of(columns, table_rules(name, list(columns), place), place)
+        filled[name] = schema.table_of(columns, schema.table_rules(name, list(columns), place), place)
     return assembled(filled, Path(NAME), **header)
 
 
@@ -394,7 +381,7 @@ def _spread(name: str, values: Any, number: int) -> Any:
     if np.shape(spread) != (number,):
         what = f"has shape {np.shape(values)} for {number} exposures"
         raise fail(what, column=name.lower(), advice="one value for each")
-    plain, masked = without_mask(spread)
+    plain, masked = schema.without_mask(spread)
     if plain.dtype.kind in "bSU":
         Place(NAME, "EXPOSURES").refuse(masked, "is masked", name.lower(), "fill or remove these")
     return spread

@@ -3,7 +3,7 @@
 A pass over the data hands over χ², Jᵀr and JᵀJ, so that residuals are neither seen nor stored here. The search runs on
 the host, since a pass may read files, in parameters scaled to their prior width.
 
-Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr, λ as in optimistix' classical trust region, from `damping` on. A start that may be
+Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr, λ following optimistix' classical trust region from `damping` on. A start that may be
             far away takes λ = 1; one near the minimum λ = 0, the Newton step, until a step leads upwards.
 Stop        `TOLERANCE`: the scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖, the distance to the minimum in standard errors. A
             Newton step is not looked at if d²/d₋₁, which steps that close in at a constant rate leave, is that small
@@ -21,10 +21,15 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 import scipy.linalg
 from jaxtyping import Float
+
+from walop_jax.model.compiled import compiled
 
 SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
@@ -43,7 +48,6 @@ LARGEST_CONDITION = 1e14
 # valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved keeps its λ
 # and with it a slow end: directions that the data hardly see then take forty steps.
 BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
-SHRINKS, GROWS = 0.25, 3.5  # factors on the region then
 
 
 @runtime_checkable
@@ -196,10 +200,26 @@ def _judged(step: Vector, here: Quadratic | None, there: Quadratic, size: float)
     if here is None:
         return size, True
     objective = there.objective if np.isfinite(there.objective) else np.inf
-    rise, predicted = objective - here.objective, _change(step, here)
-    taken = rise <= ROUNDING * abs(here.objective)
-    if not rise <= BADLY_PREDICTED * predicted:
-        # From no damping at all the first retreat is to λ = 1.
-        return SHRINKS * size if np.isfinite(size) else 1.0, taken
-    well = predicted < 0 and rise < WELL_PREDICTED * predicted
-    return GROWS * size if well else size, taken
+    slopes = here.gradient @ step, step @ here.matrix @ step
+    grown, predicted = map(np.asarray, _region(size, here.objective, objective, *slopes))
+    # From no damping at all the first retreat is to λ = 1.
+    grown = float(grown) if predicted or np.isfinite(grown) else 1.0
+    return grown, objective - here.objective <= ROUNDING * abs(here.objective)
+
+
+def _of_step(size: Any, here: Any, there: Any, slope: Any, bend: Any) -> Any:
+    """The trust region of optimistix along one step: numbers, so that one program serves any number of parameters.
+
+    Its objective is half of the sum of squares.
+    """
+    operator = lx.MatrixLinearOperator(bend[None, None], lx.positive_semidefinite_tag)
+    along = optx.FunctionInfo.EvalGradHessian(0.5 * here, slope[None], operator)
+    state = eqx.tree_at(lambda s: s.step_size, _REGION.init(jnp.zeros(1), None), size)  # pyright: ignore[reportArgumentType]
+    grown, accept, *_ = _REGION.step(
+        jnp.array(False), jnp.zeros(1), jnp.ones(1), along, optx.FunctionInfo.Eval(0.5 * there), state
+    )
+    return grown, accept
+
+
+_REGION = optx.ClassicalTrustRegion(low_cutoff=BADLY_PREDICTED, high_cutoff=WELL_PREDICTED)
+_region = compiled(_of_step, kept_as="region")

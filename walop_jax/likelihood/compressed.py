@@ -23,21 +23,13 @@ from numpy.polynomial import legendre
 from walop_jax.data.merge import without_frames
 from walop_jax.data.records import Block, CalibrationSet, Compression, Points
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.likelihood import limits
-from walop_jax.likelihood.frames import (
-    FrameSums,
-    PixelExpansion,
-    Vector,
-    half_gradient,
-    information_of,
-    unit_slopes_at,
-)
+from walop_jax.likelihood import frames, limits
 from walop_jax.likelihood.inverses import whitening
 
 SINGULAR = 1e-12  # of the largest eigenvalue: directions of the parameters without data
 
 
-def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c p"]]:
+def _shares(edges: frames.Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c p"]]:
     """Places of the points along a side of the frame, and the contribution of each cell between `edges` to them."""
     cells, (nodes, weights) = len(edges) - 1, legendre.leggauss(limits.COMPRESSED_POINTS)
     count = len(nodes)
@@ -53,7 +45,7 @@ def _shares(edges: Vector) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "
     return np.concatenate(places), shares
 
 
-def compressed(expansion: PixelExpansion) -> CalibrationSet:
+def compressed(expansion: frames.PixelExpansion) -> CalibrationSet:
     """The set of points that stands for all pixels near the values of an expansion, and the rows of a table beside."""
     sums = expansion.sums
     cells, likelihood = sums.cells, sums.likelihood
@@ -95,19 +87,19 @@ def compressed(expansion: PixelExpansion) -> CalibrationSet:
 
 
 def _with_gradient(
-    sums: FrameSums,
+    sums: frames.FrameSums,
     pull: Float[np.ndarray, "p e k"],
     weight: Float[np.ndarray, "p e k"],
     unit: Float[np.ndarray, "p e k"],
-    place: tuple[Vector, Vector],
+    place: tuple[frames.Vector, frames.Vector],
 ) -> Float[np.ndarray, "p e k"]:
     """The pull at points without its component along the flux, with the gradient of all pixels."""
-    matrix = information_of(sums, weight.T, unit.T).transpose(3, 2, 0, 1)
+    matrix = frames.information_of(sums, weight.T, unit.T).transpose(3, 2, 0, 1)
     inverse = np.where(weight > 0, 1.0 / np.where(weight > 0, weight, 1.0), 0.0)
     pull = np.einsum("pekl,pel->pek", matrix, inverse * pull)
-    slopes = unit_slopes_at(sums.likelihood, sums.instrument, *place)
+    slopes = frames.unit_slopes_at(sums.likelihood, sums.instrument, *place)
     changes = np.einsum("pekl,peln->pekn", matrix, slopes, optimize=True)
-    lacking = -half_gradient(sums) - np.einsum("pekn,pek->n", slopes, pull)
+    lacking = -frames.half_gradient(sums) - np.einsum("pekn,pek->n", slopes, pull)
     normal = np.einsum("pekn,pekm->nm", slopes, changes, optimize=True)
     root = whitening(normal, SINGULAR)
     return pull + changes @ (root @ (root.T @ lacking))

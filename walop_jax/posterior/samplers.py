@@ -121,7 +121,11 @@ def make_sampler(
     if isinstance(sampler, type):
         kind = sampler
     elif ".py:" in sampler:
-        kind = _from_file(*sampler.rsplit(":", 1))
+        file, name = sampler.rsplit(":", 1)
+        kinds = classes_of(file, Sampler, "give a sampler as FILE.py:CLASS")
+        if name not in kinds:
+            raise fail(f"has no sampler {name!r}", file=file, advice=nearest(name, kinds))
+        kind = kinds[name]
     elif sampler in SAMPLERS:
         module, name = SAMPLERS[sampler].split(":")
         kind = getattr(importlib.import_module(module), name)
@@ -143,10 +147,3 @@ def _check_settings(kind: type[Sampler], settings: Mapping[str, Any], given: boo
     if unknown:
         advice = "set it in the sampler that you give" if given else "leave it out"
         raise fail(f"{unknown[0]!r} is no option of the sampler {kind.name!r}", advice=advice)
-
-
-def _from_file(file: str, name: str) -> type[Sampler]:
-    kinds = classes_of(file, Sampler, "give a sampler as FILE.py:CLASS")
-    if name not in kinds:
-        raise fail(f"has no sampler {name!r}", file=file, advice=nearest(name, kinds))
-    return kinds[name]

@@ -454,9 +454,8 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         except DataError as error:
             missing.append(f"Parameters against time are not drawn: {error}.")
         return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
-    names = {
-        name: words for name, words in texts("captions").items() if re.fullmatch(rf"{kind}.*\.png", name)
-    }
+    pattern = rf"{kind}.*\.png"
+    names = {name: words for name, words in texts("captions").items() if re.fullmatch(pattern, name)}
     missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
     return [  # panels of watch are below each other: whole on a narrow screen
         Picture(embedded((folder / name).read_bytes()), words, small=kind == "watch")
