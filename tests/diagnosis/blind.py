@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from linear_judge import Linear
+from linear_judge import Linear, joined
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
@@ -376,7 +376,7 @@ class Cached(Linear):
         self.adoptions.append((trial, state.evidence))
         steps = (*state.steps, trial)
         way = self.removed, tuple(step.item.probe.name for step in steps if step.item is not None)
-        after = state.evidence.joined(item, self.spaces.get(way))
+        after = joined(state.evidence, item, self.spaces.get(way))
         if len(self.spaces) > KEPT:
             self.spaces.clear()
         self.spaces[way] = after.space

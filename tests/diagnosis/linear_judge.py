@@ -8,7 +8,10 @@ from collections.abc import Mapping, Sequence
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.hypotheses import Ranked
+from walop_jax.diagnosis.score import ScoreSpace
 from walop_jax.diagnosis.search import State
+from walop_jax.model.effects import Described
 
 
 class Linear:
@@ -37,5 +40,25 @@ class Linear:
     def adopted(self, state: State, trial: Trial) -> State:
         """The state with the evidence of what is left once a trial has joined the model."""
         assert trial.item is not None
-        evidence = state.evidence.joined(trial.item)
+        evidence = joined(state.evidence, trial.item)
         return dataclasses.replace(state, evidence=evidence, steps=(*state.steps, trial))
+
+
+def joined(evidence: Evidence, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
+    """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
+    space, reduce = evidence.space.with_base([item.probe.name])
+    scores, square = reduce(evidence.scores, evidence.square)
+    space = known or space
+    effect = item.effect
+    return dataclasses.replace(
+        evidence,
+        space=space,
+        scores=scores,
+        square=square,
+        table=space.table_after(evidence.table, scores),
+        probes=[p for p in evidence.probes if p.effect is not effect or effect is Described],
+        sentences=[probe for probe in evidence.sentences if probe is not item.probe],
+        parts=[(probe, set(effects) - {effect}) for probe, effects in evidence.parts],
+        chi2=evidence.chi2 - item.score.statistic * (evidence.table.noise_scale * evidence.scale) ** 2,
+        dof=evidence.dof - item.score.rank,
+    )

@@ -125,12 +125,8 @@ class Measured:
         """Change by every pattern in its camera in every used row, in standard errors, the flux held."""
         size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
         points, exposures = np.nonzero(self.used)
-        pairs = [
-            (k, pattern)
-            for stratum in strata
-            for k, pattern in zip(stratum.camera, stratum.patterns, strict=True)
-        ]
-        changes = np.empty((len(size), len(pairs)), order="F")
+        pairs = itertools.chain(*(zip(s.camera, s.patterns, strict=True) for s in strata))
+        changes = np.empty((len(size), sum(len(s.camera) for s in strata)), order="F")
         for a, (k, pattern) in enumerate(pairs):
             values = np.broadcast_to(pattern, self.used.shape)[points, exposures]
             np.multiply(size[:, k], values, out=changes[:, a])
@@ -207,9 +203,8 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     smooth = legendre.basis(points.x, points.y, SMOOTH, scale)
     fine = legendre.basis(points.x, points.y, FINE, scale)[:, smooth.shape[1] :]
     square = points.x**2 + points.y**2
-    rings = legvander(2.0 * square / max(float(square.max()), 1e-300) - 1.0, thresholds.RINGS[-1])[
-        :, thresholds.RINGS
-    ]
+    squared_radius = 2.0 * square / max(float(square.max()), 1e-300) - 1.0
+    rings = legvander(squared_radius, thresholds.RINGS[-1])[:, thresholds.RINGS]
     stokes = measured.likelihood.stokes(measured.values)
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
@@ -246,16 +241,12 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
         ("filter", e.filter, ""),
         *((("plate" if prefix == "chwp" else prefix), label, "") for prefix, label in positions),
     ):
-        patterns = [
-            np.where(label == group, stokes[..., i], 0.0) for group in np.unique(label)[1:] for i in range(3)
-        ]
+        groups = itertools.product(np.unique(label)[1:], range(3))
+        patterns = [np.where(label == group, stokes[..., i], 0.0) for group, i in groups]
         if patterns:
             yield _in_each(all_cameras, name, patterns, block)
-    sky_gradients = [
-        np.where(e.kind == group, term[:, None], 0.0)
-        for group in np.unique(e.kind)[1:]
-        for term in smooth.T[1:3]
-    ]
+    groups = itertools.product(np.unique(e.kind)[1:], smooth.T[1:3])
+    sky_gradients = [np.where(e.kind == group, term[:, None], 0.0) for group, term in groups]
     if sky_gradients:
         yield _in_each(all_cameras, "kind, over the field", sky_gradients)
     if measured.has_gains:

@@ -300,7 +300,7 @@ def detection_limits(
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
     examination = examine(result, listed, rng)
-    p = examination.table.local(thresholds.ALARM)
+    p = local_p(thresholds.ALARM, examination.table.trials)
     tell(Stage("comparing the effects", "comparing"))
     rivals = examination.bare.subset([probe.name for probe in examination.probes])
     columns = [c for probe in examination.probes for c in _columns(examination, rivals, probe, p)]

@@ -131,9 +131,8 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
 
 def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again."""
-    return try_model(
-        base, instance.kind, with_effects(base.model, [instance], context), base.values, prior_shapes
-    )
+    model = with_effects(base.model, [instance], context)
+    return try_model(base, instance.kind, model, base.values, prior_shapes)
 
 
 def try_sentences(base: FitResult, description: Described, context: Context, count: int) -> Trial:
@@ -167,10 +166,8 @@ def try_model(
 def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
     """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
     places = ((item.probe, item.score), *item.others)
-    trials = [
-        try_effect(base, item.effect.combine(probe.group, score.amplitudes), context, shapes)
-        for probe, score in places
-    ]
+    steps = (item.effect.combine(probe.group, score.amplitudes) for probe, score in places)
+    trials = [try_effect(base, step, context, shapes) for step in steps]
     converged = [t for t in trials if t.fit is not None and t.fit.converged]
     best = max(converged or trials[:1], key=lambda t: t.evidence)
     alike = [t for t in converged if t.evidence > best.evidence - thresholds.EVEN_ODDS]
@@ -191,9 +188,8 @@ def _differ(first: Trial, second: Trial) -> bool:
 
 def in_words(effect: Effect) -> str:
     """Choices and values of an effect, e.g. "camera = 2, depth = 0.006"."""
-    values = {
-        leaf.name: f"{v:.4g}" for leaf, v in zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
-    }
+    pairs = zip(leaves(effect), np.asarray(values_of(effect)), strict=True)
+    values = {leaf.name: f"{value:.4g}" for leaf, value in pairs}
     return ", ".join(f"{name} = {value}" for name, value in (spoken_choices(effect) | values).items())
 
 
@@ -340,10 +336,8 @@ def _screened(
     for name in result.model.effect_names:
         start[result.model.positions(name)] = result.values[result.model.positions(name)]
     likelihood = Likelihood.of(calset, result.model)
-    places = [
-        Design.of(dataclasses.replace(result, likelihood=likelihood, values=values))
-        for values in (result.values, start)
-    ]
+    fits = (dataclasses.replace(result, likelihood=likelihood, values=v) for v in (result.values, start))
+    places = list(map(Design.of, fits))
     reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
         try:

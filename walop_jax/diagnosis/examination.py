@@ -222,25 +222,6 @@ class Evidence:
         scores = (self.beside_patterns[1][probe.name] for probe in probes)
         return any(self.is_clear(s) for s in scores)
 
-    def joined(self, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
-        """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
-        space, reduce = self.space.with_base([item.probe.name])
-        scores, square = reduce(self.scores, self.square)
-        space = known or space
-        effect = item.effect
-        return dataclasses.replace(
-            self,
-            space=space,
-            scores=scores,
-            square=square,
-            table=space.table_after(self.table, scores),
-            probes=[p for p in self.probes if p.effect is not effect or effect is Described],
-            sentences=[probe for probe in self.sentences if probe is not item.probe],
-            parts=[(probe, set(effects) - {effect}) for probe, effects in self.parts],
-            chi2=self.chi2 - item.score.statistic * (self.table.noise_scale * self.scale) ** 2,
-            dof=self.dof - item.score.rank,
-        )
-
     def sentences_before_names(self) -> list[Ranked]:
         """Sentences that are more probable than every name."""
         best = max((item.log_bayes for item in self.significant), default=-np.inf)

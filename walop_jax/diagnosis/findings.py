@@ -91,17 +91,13 @@ def describe(design: Design, rows: Float[np.ndarray, " _"]) -> dict[str, Any]:
     by_exposure, point_counts = square.sum(axis=(0, 2)), design.measured.used.sum(axis=0)
 
     def grouped(labels: np.ndarray) -> str | None:
-        shares, plan = (
-            {str(label): float(of[labels == label].sum()) for label in np.unique(labels)}
-            for of in (by_exposure, point_counts)
-        )
-        return _differing(shares, plan)
+        sums = by_exposure, point_counts
+        return _differing(*({str(n): float(of[labels == n].sum()) for n in np.unique(labels)} for of in sums))
 
     stood = {prefix: positions_of(e, prefix) for prefix in design.measured.likelihood.plan.moving}
     harmonics, field = _harmonics(design, cube)
-    settings = np.unique(
-        [e.kind, e.filter, *(at.astype(str) for at in stood.values())], axis=1, return_inverse=True
-    )[1]
+    labels = [e.kind, e.filter, *(at.astype(str) for at in stood.values())]
+    settings = np.unique(labels, axis=1, return_inverse=True)[1]
     trend = _trend(e, settings.ravel(), np.sqrt(by_exposure / np.maximum(len(names) * point_counts, 1)))
     cameras = dict(zip(names, square.sum(axis=(0, 1)).tolist(), strict=True))
     return {
@@ -307,16 +303,14 @@ class Diagnosis(Drawn):
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "
                 "that are"
             )
-        far = [
-            f"{s.effect}.{name} ({widths:.0f} widths)" for s in self.steps for name, widths in s.far.items()
-        ]
-        if far:
-            cautions.append(f"far beyond its prior, which was widened: {', '.join(far)}")
-        weak = [s.effect for s in self.steps if s.robust_ratio > thresholds.LARGEST_ROBUST_RATIO]
-        if weak:
+        widened = ((s.effect, name, widths) for s in self.steps for name, widths in s.far.items())
+        if far := ", ".join(f"{effect}.{name} ({widths:.0f} widths)" for effect, name, widths in widened):
+            cautions.append(f"far beyond its prior, which was widened: {far}")
+        ratio = thresholds.LARGEST_ROBUST_RATIO
+        if weak := ", ".join(s.effect for s in self.steps if s.robust_ratio > ratio):
             cautions.append(
-                f"errors of {', '.join(weak)} are too small by more than a factor "
-                f"{thresholds.LARGEST_ROBUST_RATIO:g} if single exposures have disturbances of their own"
+                f"errors of {weak} are too small by more than a factor {ratio:g} if single exposures have disturbances "
+                "of their own"
             )
         return "; ".join(cautions)
 
@@ -455,16 +449,14 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
     if step.get("change_of_qu") is not None:
         size = f"{100 * step['change_of_qu']:.2g} %"
         yield f"{name} changes calibrated q and u by up to {size}{', which is negligible' * bool(step['negligible'])}"
-    places = {
-        key: str(value)
-        for key, value in step.get("where", {}).items()
-        if value is not None and not str(value).endswith(" 100%")
-    }
-    if places:
-        words = (f"{key}: {value}".replace("_", " ").replace("%", " %") for key, value in places.items())
-        yield f"{name}, share of the misfit that it removes, by {'; by '.join(words)}".replace(
-            "clp harmonic", "harmonic of the polariser angle"
+    places = [f"{key}: {value}" for key, value in step.get("where", {}).items() if value is not None]
+    if places := "; by ".join(place for place in places if not place.endswith(" 100%")):
+        words = (
+            places.replace("_", " ")
+            .replace("%", " %")
+            .replace("clp harmonic", "harmonic of the polariser angle")
         )
+        yield f"{name}, share of the misfit that it removes, by {words}"
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
         yield f"{name}: these data cannot distinguish it from {some(rivals, thresholds.SHOWN)}"

@@ -127,11 +127,9 @@ def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake
             kind, size = EFFECT if rival.stated is None else DATA, float(sizes[0])
             number = rival.candidate.name, kind, size, rival.unit, rival.shown_by
             yield _Mistake(*number, along[:, 0], bool(alive[0]))
-    for probe in of_stars.asked:
-        if probe.name not in shown:
-            widths = probe.widths
-            nothing = np.zeros((len(singles.along), len(widths)))
-            yield from of_stars.effects(probe, widths, nothing, np.zeros(len(widths), bool))
+    for probe in (probe for probe in of_stars.asked if probe.name not in shown):
+        nothing, alive = np.zeros((len(singles.along), len(probe.widths))), np.zeros(len(probe.widths), bool)
+        yield from of_stars.effects(probe, probe.widths, nothing, alive)
 
 
 class _Starlight:
@@ -177,13 +175,12 @@ class _Starlight:
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
     """Each amplitude of a probe by itself: its parameter, and the effect with it at its size."""
     remaining = iter(sizes)
-    for member in probe.group:
-        for name in probe.effect.amplitudes():
-            neutral = np.asarray(getattr(member, name), float)
-            for at in np.ndindex(neutral.shape):
-                value = neutral.copy()
-                value[at] += next(remaining)
-                yield name, member.replaced(**{name: jnp.asarray(value)})
+    for member, name in itertools.product(probe.group, probe.effect.amplitudes()):
+        neutral = np.asarray(getattr(member, name), float)
+        for at in np.ndindex(neutral.shape):
+            value = neutral.copy()
+            value[at] += next(remaining)
+            yield name, member.replaced(**{name: jnp.asarray(value)})
 
 
 def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:

@@ -132,10 +132,6 @@ class ScoreTable:
         ranked = sorted((s for s in self.scores if s.testable), key=lambda s: s.log_p)
         return tuple(score.name for score in ranked if self.corrected(score) < alarm)[:most]
 
-    def local(self, p: float) -> float:
-        """The local p that the smallest of all candidates undercuts with probability `p` under the base."""
-        return local_p(p, self.trials)
-
 
 def corrected_p(log_p: float, trials: float) -> float:
     """Šidák correction 1 − (1 − p)^n, from ln p."""
@@ -229,10 +225,8 @@ class ScoreSpace:
     def subset(self, names: Sequence[str]) -> ScoreSpace:
         """The space of some of the candidates."""
         keep, sizes = self.chosen(names), dict(zip(self.names, self.sizes, strict=True))
-        return ScoreSpace(
-            tuple(names), tuple(sizes[n] for n in names), self.widths[keep], self.before[keep],
-            self.gram[np.ix_(keep, keep)], self.free,
-        )  # fmt: skip
+        counts, gram = tuple(sizes[name] for name in names), self.gram[np.ix_(keep, keep)]
+        return ScoreSpace(tuple(names), counts, self.widths[keep], self.before[keep], gram, self.free)
 
     @functools.cached_property
     def alive(self) -> Bool[np.ndarray, " _"]:
@@ -401,11 +395,8 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 
     `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
     """
-    distances = {}
-    for name, at in space.places().items():
-        z = space.whitened[name].T @ scores[at]
-        distances[name] = float(np.sqrt(max(square - float(z @ z), 0.0)))
-    return distances
+    parts = {name: space.whitened[name].T @ scores[at] for name, at in space.places().items()}
+    return {name: float(np.sqrt(max(square - float(z @ z), 0.0))) for name, z in parts.items()}
 
 
 # ------------------------------------------------------------------------------------------- products of large matrices

@@ -164,14 +164,11 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
     remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
-    return Trial(
-        item.effect,
-        item.log_bayes,
-        remaining,
+    suffices, linear = (
         explains(remaining, evidence.dof - item.score.rank),
-        item=item,
-        linear=item.log_bayes + evidence.by_fit(item.score),
+        item.log_bayes + evidence.by_fit(item.score),
     )
+    return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, linear=linear)
 
 
 def names_first(trial: Trial) -> float:
@@ -254,11 +251,8 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
 def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | None = None) -> list[Trial]:
     """The leading sentences, without those that were tried; clearly more probable than a name, if it is given."""
     least = -np.inf if name is None or name.item is None else name.item.log_bayes + thresholds.EVEN_ODDS
-    untried = [
-        item
-        for item in evidence.significant_sentences
-        if item.log_bayes > least and not any(item is trial.item for trial in tried)
-    ]
+    probable = (item for item in evidence.significant_sentences if item.log_bayes > least)
+    untried = [item for item in probable if not any(item is trial.item for trial in tried)]
     return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
 
@@ -277,9 +271,8 @@ def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Tr
     item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
     nameless = () if item is None else evidence.nameless(item, trial.sentences)
     rivals += () if item is None else evidence.held_in_part(item)
-    return dataclasses.replace(
-        trial, alternatives=tuple(shapes), rivals=tuple(dict.fromkeys(rivals)), nameless=nameless
-    )
+    others = tuple(dict.fromkeys(rivals))
+    return dataclasses.replace(trial, alternatives=tuple(shapes), rivals=others, nameless=nameless)
 
 
 def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Reason]:
@@ -299,9 +292,7 @@ def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Itera
 
 def _too_far(evidence: Evidence, item: Ranked) -> str:
     """Reason for which a significant candidate was not tried: the candidates before it."""
-    names, sentences = evidence.significant, evidence.significant_sentences
-    best = max([*names[:1], *sentences[:1]], key=lambda ranked: ranked.log_bayes)
+    leading = *evidence.significant[:1], *evidence.significant_sentences[:1]
+    best = max(leading, key=lambda ranked: ranked.log_bayes)
     gap = best.log_bayes - item.log_bayes
-    if best is item or gap <= 0.0:
-        return "others were tried first"
-    return f"{best.name} is more probable, by {gap:.3g} in ln B"
+    return f"{best.name} is more probable, by {gap:.3g} in ln B" if gap > 0.0 else "others were tried first"

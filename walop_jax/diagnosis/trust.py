@@ -239,8 +239,7 @@ def _far_from_pixels(result: FitResult) -> Iterator[str]:
 
 def _hold_no_noise(design: Design) -> bool:
     """True if the data are the model's at some values of its parameters: what priors pull at, noise has not made."""
-    data = slice(0, design.rows)
-    remainder = Projector(design.jacobian[data])(design.residual[data])
+    remainder = Projector(design.jacobian[: design.rows])(design.residual[: design.rows])
     return float(remainder @ remainder) < NOISELESS * design.rows
 
 

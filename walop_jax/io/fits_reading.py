@@ -38,20 +38,9 @@ LARGEST_UNPACKED = 1 << 31
 """Bytes of the content of a packed file that are read at most: a small file may unpack to any size."""
 
 UNREADABLE = (
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-    lzma.LZMAError,
-    zipfile.BadZipFile,
-    fits.VerifyError,
-)
+    OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, OverflowError, struct.error, zlib.error,
+    lzma.LZMAError, zipfile.BadZipFile, fits.VerifyError,
+)  # fmt: skip
 """Errors that astropy raises on a damaged file, some of it only when a header or a column is used."""
 
 

@@ -166,8 +166,9 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     unknown moving element.
     """
     settings.check_moving(instrument.patched().moving())
-    blank = blank_exposures(instrument, len(settings))
-    plan, band = _plan(instrument, settings, np.zeros(len(settings)), filters, blank)
+    hours, count = np.zeros(len(settings)), len(settings)
+    blank = blank_exposures(instrument, count)
+    plan, band = _plan(instrument, settings, hours, filters, blank, np.full(count, ""), np.zeros(count, bool))
     return dataclasses.replace(plan, band_of=band[:, None])
 
 
@@ -238,8 +239,8 @@ def _plan(
     hours: Float[np.ndarray, " n"],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
-    kinds: np.ndarray | None = None,
-    slope: Bool[np.ndarray, " n"] | None = None,
+    kinds: np.ndarray,
+    slope: Bool[np.ndarray, " n"],
 ) -> tuple[Plan, Int[np.ndarray, " n"]]:
     """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
     requirements, patched, count = needs(instrument), instrument.patched(), len(settings)
@@ -256,9 +257,7 @@ def _plan(
     states = _rows([*places, *turns], count)
     planned = _rows([values[name] for name in names], count)
     teff = np.nan_to_num(settings.teff).tolist()
-    sloping = np.zeros(count, bool) if slope is None else slope
-    labels = [""] * count if kinds is None else kinds.tolist()
-    columns = (states, settings.filter.astype(str).tolist(), planned, teff, sloping.tolist(), labels)
+    columns = (states, settings.filter.astype(str).tolist(), planned, teff, slope.tolist(), kinds.tolist())
     keys = list(zip(*columns, strict=True))
     bands = sorted(set(keys))
 
@@ -303,7 +302,7 @@ def _plan(
         band_of=np.zeros((0, 1), int),
         settings=tuple(laid),
         moving=moving,
-        slope=array([key[4] for key in bands], float) if sloping.any() else None,
+        slope=array([key[4] for key in bands], float) if slope.any() else None,
     )
     index = {key: i for i, key in enumerate(bands)}
     return plan, np.array([index[key] for key in keys], int)

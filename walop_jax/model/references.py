@@ -42,8 +42,7 @@ def _optics(instrument: Instrument) -> Iterator[Reference]:
     behind = [element for arm in instrument.arms for element in (*arm.train(), arm.analyser)]
     elements = [*instrument.train(), *behind]
     for element in elements:
-        if element.reference:
-            yield Reference(element.kind.replace("_", " "), element.reference)
+        yield Reference(element.kind.replace("_", " "), element.reference)
     for element in elements:
         if isinstance(element, Wedge):
             yield Reference(element.material, GLASSES[element.material].source)
@@ -57,24 +56,20 @@ def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ..
     `filters` are the names of the used ones: built-in curves have a source.
     """
     instrument = model.template
-    entries = (
-        [Reference("the instrument and its calibration", instrument.source)] if instrument.source else []
-    )
-    entries += _optics(instrument)
-    entries.append(Reference("band integral", quadrature.SOURCE))
-    if DEFAULT_FILTER in set(filters):
-        entries.append(Reference(f"{DEFAULT_FILTER} filter curve", "Doi et al. 2010, AJ 139, 1628, Table 4"))
-    if instrument.standard.bands:
-        entries.append(Reference("colour of standards", COLOUR_OF_STANDARDS))
-    entries.append(Reference("throughput over the field", legendre.SOURCE))
-    for source in instrument.sources:
-        used = any(model.parameters[i].free for i in model.positions(source.name))
-        if source.reference and used:
-            entries.append(Reference(f"light of KIND {source.kind}", source.reference))
-    entries += [
-        Reference(f"effect {effect.name}", effect.kind.reference or _OWN) for effect in instrument.effects
+    filter_source = "Doi et al. 2010, AJ 139, 1628, Table 4" if DEFAULT_FILTER in set(filters) else ""
+    entries = [
+        Reference("the instrument and its calibration", instrument.source),
+        *_optics(instrument),
+        Reference("band integral", quadrature.SOURCE),
+        Reference(f"{DEFAULT_FILTER} filter curve", filter_source),
+        Reference("colour of standards", COLOUR_OF_STANDARDS if instrument.standard.bands else ""),
+        Reference("throughput over the field", legendre.SOURCE),
     ]
-    return tuple(dict.fromkeys(entries))
+    for source in instrument.sources:
+        if any(model.parameters[i].free for i in model.positions(source.name)):
+            entries.append(Reference(f"light of KIND {source.kind}", source.reference))
+    entries += [Reference(f"effect {e.name}", e.kind.reference or _OWN) for e in instrument.effects]
+    return tuple(dict.fromkeys(entry for entry in entries if entry.source))
 
 
 # ------------------------------------------------------------------------------------------------- as BibTeX
@@ -104,15 +99,10 @@ def bibtex(found: Sequence[Reference], version: str, *, sampled: bool = False) -
             if key in library:
                 entries[key] = library[key]
             elif (plain := _YEAR.match(work)) is not None:
-                lines = (
-                    plain["who"].replace(" et al.", " and others").replace(" & ", " and "),
-                    work,
-                    plain["year"],
-                )
-                lines = (line.replace("&", r"\&").replace("_", r"\_") for line in lines)
-                fields = zip(("author", "note", "year"), lines, strict=True)
-                listed = ",\n".join(f"  {name:<6} = {{{value}}}" for name, value in fields)
-                entries[key] = f"@misc{{{key},\n{listed}\n}}"
+                who = plain["who"].replace(" et al.", " and others").replace(" & ", " and ")
+                fields = {"author": who, "note": work, "year": plain["year"]}
+                listed = ",\n".join(f"  {name:<6} = {{{value}}}" for name, value in fields.items())
+                entries[key] = f"@misc{{{key},\n{listed}\n}}".replace("&", r"\&").replace("_", r"\_")
     entries |= {key: library[key] for key in (*_SOFTWARE, *(_OF_SAMPLES if sampled else ()))}
     return "\n\n".join(entries.values()) + "\n"
 

@@ -64,8 +64,14 @@ class Sightline:
 
 
 def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> tuple[LightStage, ...]:
-    """Every stage from the source to the counts of the cameras, through a filter of this curve."""
-    instrument = _with_source(instrument.patched(), sightline)
+    """Every stage from the source to the counts of the cameras, through a filter of this curve.
+
+    The source is one more standard star.
+    """
+    instrument = instrument.patched()
+    stars = instrument.standard
+    q, u = jnp.append(stars.q, sightline.q), jnp.append(stars.u, sightline.u)
+    instrument = instrument.with_source(Standards(q=q, u=u, names=(*stars.names, "traced")))
     plan = plan_for_settings(instrument, sightline.setting, {str(sightline.setting.filter[0]): curve})
     through = np.isfinite(sightline.clp_angle)
     exposure = dataclasses.replace(
@@ -122,13 +128,6 @@ def _about(element: Element, plan: Plan) -> str:
         return type(element).__doc__ or ""
     (angle,) = fold.positions(element, plan.moving, plan.states[:1])
     return "out of the beam" if angle is None else f"at {angle:g}°"
-
-
-def _with_source(instrument: Instrument, sightline: Sightline) -> Instrument:
-    """The instrument with one more standard star: the traced source."""
-    stars = instrument.standard
-    q, u = jnp.append(stars.q, sightline.q), jnp.append(stars.u, sightline.u)
-    return instrument.with_source(Standards(q=q, u=u, names=(*stars.names, "traced")))
 
 
 def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:

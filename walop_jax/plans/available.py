@@ -97,9 +97,8 @@ class CandidateExposure(NamedTuple):
 
     def with_plate(self, angle: float) -> CandidateExposure:
         """The same with the plate at an angle (deg)."""
-        stop = dataclasses.replace(self.stops[0], plate=angle)
-        positions = dict(self.positions) | {CALIBRATION_PLATE: angle}
-        return self._replace(positions=positions, stops=(stop,), free=False)
+        stops = (dataclasses.replace(self.stops[0], plate=angle),)
+        return self._replace(positions={**self.positions, CALIBRATION_PLATE: angle}, stops=stops, free=False)
 
     def text(self) -> str:
         """In a few words."""

@@ -124,9 +124,8 @@ class Experiment:
         lost_share = np.linalg.norm(lost, axis=(2, 3)) if lost.shape[2] else np.zeros(lost.shape[:2])
         bad = np.flatnonzero((lost_share > 1e-6 * np.linalg.norm(visible, axis=(2, 3))).any(axis=0))
         if len(bad):
-            raise NotEstimableError(
-                f"targets {', '.join(map(str, bad[:5].tolist()))} depend on parameters that no candidate informs about"
-            )
+            listed = ", ".join(map(str, bad[:5].tolist()))
+            raise NotEstimableError(f"targets {listed} depend on parameters that no candidate informs about")
         families = tuple(family.turned(to_seen[None]) for family in self.families)
         # Directions that a few candidates leave open get next to no information: no target needs them, or it is bad.
         prior = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(informed.sum()))
@@ -187,13 +186,9 @@ class _Some:
 
     def __init__(self, experiment: Experiment, chosen: Sequence[tuple[int, Float[np.ndarray, " _"]]]) -> None:
         self.experiment, self.chosen = experiment, list(chosen)
-        matrices, costs = [], []
-        for number, place in self.chosen:
-            family, at = experiment.families[number], np.atleast_2d(place)
-            matrices.append(family.information(at)[:, 0])
-            costs.append(float(family.cost_at(at)[0]))
-        self.matrices = np.stack(matrices, axis=1)  # (r, s, n, n)
-        self.costs = np.array(costs)
+        places = [(experiment.families[number], np.atleast_2d(place)) for number, place in self.chosen]
+        self.matrices = np.stack([f.information(at)[:, 0] for f, at in places], axis=1)  # (r, s, n, n)
+        self.costs = np.array([float(family.cost_at(at)[0]) for family, at in places])
         _, k, _, q = experiment.targets.shape
         self.wide = _side_by_side(experiment.targets)
         self.per_target = (k, q)
@@ -283,12 +278,10 @@ class _Some:
         mu = level.mean() / constraints
         level = level + len(level) * mu
         least = 0.2 * gap * level.mean() / constraints
-        while True:
-            last = mu <= 1.1 * least
-            weight, level = self._centred(weight, level, mu, _EXACT if last else _ROUGH)
-            if last:
-                break
+        while mu > 1.1 * least:
+            weight, level = self._centred(weight, level, mu, _ROUGH)
             mu = max(mu / _SHARPER, least)
+        weight, level = self._centred(weight, level, mu, _EXACT)
         slack = self._slack(level, self.variances(self.covariance(weight)))
         return weight, self.experiment.of_one(1.0 / np.maximum(slack, 1e-300))
 
@@ -329,9 +322,8 @@ class _Some:
             pushed = y[sample] * np.repeat(push[sample], self.per_target[1], axis=1)[:, None]
             inverse_root = np.linalg.inv(np.linalg.cholesky(self.information(weight)[sample]))
             right = root_of(pushed @ np.swapaxes(y[sample], 1, 2), _MAIN)
-            flat = np.moveaxis(
-                inverse_root[:, None] @ (self.matrices[sample] @ right[:, None]), 1, 0
-            ).reshape(s, -1)
+            products = inverse_root[:, None] @ (self.matrices[sample] @ right[:, None])
+            flat = np.moveaxis(products, 1, 0).reshape(s, -1)
             alike = push.sum() / push[sample].sum()
             hessian = np.zeros((s + r, s + r))
             gradient = np.zeros(s + r)

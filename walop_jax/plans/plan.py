@@ -12,6 +12,7 @@ Order        Settings one after the other, the polariser turning one way in each
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -418,11 +419,9 @@ def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tu
     best = _within(found, experiment, weights, range(len(found.choices)))
     for setting in settings if len(settings) > 1 else ():
         remaining = [i for i, choice in enumerate(found.choices) if choice.setting != setting]
-        try:
+        with contextlib.suppress(ValueError):
             trial = _within(found, experiment, weights, remaining)
-        except ValueError:
-            continue
-        best = min(best, trial, key=lambda one: one[0].value)
+            best = min(best, trial, key=lambda pair: pair[0].value)
     return best
 
 
@@ -470,8 +469,7 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
         return (0, number, line.place[0]) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
 
     lines.sort(key=key)
-    done = [line for line in lines if key(line)[0] == 0]
-    sky = [line for line in lines if key(line)[0] == 1]
+    done, sky = ([line for line in lines if key(line)[0] == place] for place in (0, 1))
     where = dict(zip(sky, _pointings(found, sky), strict=True))
     while sky:
         same = [line for line in sky if key(line) == key(sky[0])]

@@ -80,16 +80,10 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
         if p.prior is not None:
             values[i] = rng.normal(*p.prior)
     values[series_indices(model.template)] = _throughput(model.template, rng).ravel()
-    return jax.tree.map(
-        _possible, model.instrument(values[model.masters]), is_leaf=lambda node: isinstance(node, Analyser)
-    )
-
-
-def _possible(node: Any) -> Any:
-    """An analyser with no more than all of the light in its beams; whatever else as it is."""
-    if not isinstance(node, Analyser):
-        return node
-    return dataclasses.replace(node, efficiency=jnp.minimum(node.efficiency, 1.0))
+    instrument = model.instrument(values[model.masters])
+    for place in instrument.places(Analyser):
+        instrument = instrument.changed(place, efficiency=lambda drawn: jnp.minimum(drawn, 1.0))
+    return instrument
 
 
 def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndarray, "k t"]:

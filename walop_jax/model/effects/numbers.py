@@ -160,12 +160,9 @@ KINDS |= {
 OF_POLARISER = ("extinction", "ellipticity")
 KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
+_ALONE = Grows(tried=(Combinations(),))
 KINDS["shift"] = Kind(
-    "wavelength",
-    _of_instrument,
-    test=_OF_BAND,
-    grows=lambda *_: Grows(tried=(Combinations(),)),
-    slots=itself("whole"),
+    "wavelength", _of_instrument, test=_OF_BAND, grows=lambda *_: _ALONE, slots=itself("whole")
 )
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
 KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))

@@ -11,23 +11,11 @@ from walop_jax.model.elements import geometry, simple, spectral, wave_plate
 from walop_jax.model.elements.base import Element
 
 ELEMENTS: tuple[type[Element], ...] = (
-    simple.Polariser,
-    simple.Collimator,
-    simple.RadialRetarder,
-    geometry.PupilMapping,
-    geometry.Wedge,
-    wave_plate.WavePlate,
-    simple.Retarder,
-    simple.Rotator,
-    simple.Diattenuator,
-    simple.Depolariser,
-    simple.AddedPolarisation,
-    spectral.SpectralElement,
-    spectral.FieldDiattenuator,
-    spectral.Mirror,
-    simple.AnalysisVector,
-    simple.Analyser,
-)
+    simple.Polariser, simple.Collimator, simple.RadialRetarder, geometry.PupilMapping, geometry.Wedge,
+    wave_plate.WavePlate, simple.Retarder, simple.Rotator, simple.Diattenuator, simple.Depolariser,
+    simple.AddedPolarisation, spectral.SpectralElement, spectral.FieldDiattenuator, spectral.Mirror,
+    simple.AnalysisVector, simple.Analyser,
+)  # fmt: skip
 
 
 def defined_elements() -> tuple[type[Element], ...]:
