@@ -60,7 +60,7 @@ LINES = {
         Line("limits plan.toml -o LIMITS", "limits", "minutes"),
     ],
     "plan": [
-        Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan"),
+        Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan", "seconds"),
         Line("plan plan.toml --minutes 20 --draws 1 --schedule night.json -o PLAN", "plan", "seconds"),
         Line("plan WALOP-SOUTH --minutes 20 --draws 1 -o PLAN", "plan", "minutes"),
         Line("plan RUN --minutes 10 --draws 1 -o PLAN", "plan", "minutes"),
@@ -74,7 +74,7 @@ LINES = {
     "compare": [Line("compare set.fits -o COMPARED", "comparison", "minutes")],
     "certify": [Line("certify RUN"), Line("certify RUN -o NIGHT", "commissioning")],
     "epoch": [Line("epoch RUN set.fits -o LATER", "epoch", "seconds"), Line("epoch RUN set.fits")],
-    "watch": [Line("watch RUN stars.fits -o WATCHED", "watch")],
+    "watch": [Line("watch RUN stars.fits -o WATCHED", "watch", "seconds")],
     "affected": [Line("affected RUN RUN stars.fits -o AFFECTED", "affected", "seconds")],
     "quality": [Line("quality RUN -o QUALITY.ecsv --figure quality.png", takes="seconds")],
     "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
