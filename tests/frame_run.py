@@ -14,8 +14,8 @@ def frame_run(side: int) -> ObservingPlan:
     )  # fmt: skip
 
 
-def raster(side: int) -> Grid:
-    """The pixels of a square detector at the points of `frame_run`."""
-    field = frame_run(side).field
+def raster(plan: ObservingPlan, side: int) -> Grid:
+    """The pixels of a square detector over the whole field: the points of a plan whose `grid` is `side`."""
+    field = plan.field
     step = 2.0 * field / (side - 1)
     return Grid(side, side, (1.0, 1.0), (-field, -field), ((step, 0.0), (0.0, step)))

@@ -14,7 +14,7 @@ from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeDecorHintException
 
 # As in PEP 484, and as pyright has it, an int may stand where a float is asked for.
-_beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
+_beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckError))
 _jaxtyped = jaxtyping.jaxtyped
 _TOGETHER = _jaxtyped("context")
 _RESOLVED: dict[tuple[str, Any], Any] = {}

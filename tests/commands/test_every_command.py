@@ -1,4 +1,4 @@
-"""Every command of the program and of the README, with `-o`, on the set that comes with the package; and back.
+"""Every command of the program and of the README, with `-o`, on one small set; and back.
 
 Each line is typed in a folder that holds what users have. What it writes is read with `walop.read` or as a table, a
 folder is reported, and the commands that the program suggests next are typed as they are printed.
@@ -18,21 +18,18 @@ from astropy.io import fits
 from astropy.table import Table
 from camera_files import four, some_stars
 from command import Call
-from frame_run import frame_run
+from frame_run import frame_run, raster
 from frames_file import write_frames
 from own_instrument import OWN
-from small_run import SEED, SMALL
 from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import NEXT, UNTRUSTED
-from walop_jax.data.grid import Grid
 from walop_jax.likelihood import limits
 from walop_jax.simulation.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
-SET = ROOT / "fits_data" / "walop_south_small.fits"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -63,21 +60,21 @@ LINES = {
         Line("limits plan.toml -o LIMITS", "limits", "minutes"),
     ],
     "plan": [
-        Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan"),
+        Line("plan bench.toml --minutes 10 --draws 1 --criterion window.delta -o PLAN", "plan", "seconds"),
         Line("plan plan.toml --minutes 20 --draws 1 --schedule night.json -o PLAN", "plan", "seconds"),
         Line("plan WALOP-SOUTH --minutes 20 --draws 1 -o PLAN", "plan", "minutes"),
         Line("plan RUN --minutes 10 --draws 1 -o PLAN", "plan", "minutes"),
     ],
     "sample": [Line("sample SAMPLED", takes="minutes")],
-    "report": [Line("report RUN"), Line("report RUN -o page.html")],
+    "report": [Line("report RUN"), Line("report RUN -o page.html", takes="seconds")],
     "plot": [Line("plot RUN matrix -o matrix.pdf"), Line("plot RUN")],
     "matrix": [Line("matrix RUN --points points.csv -o matrix.fits"), Line("matrix RUN --x 0.1 --y 0.2")],
     "gather": [Line("gather O1.fits E1.fits O2.fits E2.fits -o gathered.ecsv")],
     "apply": [Line("apply RUN stars.fits -o corrected.fits", takes="seconds")],
-    "compare": [Line("compare turn.fits -o COMPARED", "comparison", "minutes")],
+    "compare": [Line("compare set.fits -o COMPARED", "comparison", "minutes")],
     "certify": [Line("certify RUN"), Line("certify RUN -o NIGHT", "commissioning")],
     "epoch": [Line("epoch RUN set.fits -o LATER", "epoch", "seconds"), Line("epoch RUN set.fits")],
-    "watch": [Line("watch RUN stars.fits -o WATCHED", "watch")],
+    "watch": [Line("watch RUN stars.fits -o WATCHED", "watch", "seconds")],
     "affected": [Line("affected RUN RUN stars.fits -o AFFECTED", "affected", "seconds")],
     "quality": [Line("quality RUN -o QUALITY.ecsv --figure quality.png", takes="seconds")],
     "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
@@ -139,11 +136,11 @@ def test_every_command_of_the_readme_is_among_them():
 
 
 @pytest.fixture(scope="module")
-def home(call: Call, tmp_path_factory) -> Path:
+def home(calset_file: Path, run: Path, tmp_path_factory) -> Path:
     """A folder with what users have: a set and its fit, stars, points, plans, exports of a design program."""
     folder = tmp_path_factory.mktemp("home")
-    shutil.copyfile(SET, folder / "set.fits")
-    assert call("refit", folder / "set.fits", "-o", folder / "RUN", "--quiet").exit_code == 0
+    shutil.copyfile(calset_file, folder / "set.fits")
+    shutil.copytree(run, folder / "RUN")
     (folder / "plan.toml").write_text(PLAN)
     (folder / "own.toml").write_text(OWN)
     (folder / "bench.toml").write_text(BENCH)
@@ -190,8 +187,6 @@ def test_so_is_what_takes_seconds(line: Line, call, here: Path):
 def test_so_is_what_takes_minutes(line: Line, call, here: Path):
     if line.words.startswith("sample"):
         shutil.copytree("RUN", "SAMPLED")
-    if line.words.startswith("compare"):  # the polynomial of Paper II needs five angles, the set has four
-        walop.write_calibration_set(here / "turn.fits", simulate(SMALL, seed=SEED).calset)
     if "frames.fits" in line.words:
         _frames(here / "frames.fits")
     _type(line, call)
@@ -220,9 +215,7 @@ def _frames(path: Path) -> None:
     """Whole frames, so large that they are fitted by sums over cells."""
     side = int(limits.LARGE_ABOVE**0.5) + 8
     run = frame_run(side)
-    step = 2 * run.field / (side - 1)
-    grid = Grid(side, side, (1.0, 1.0), (-run.field, -run.field), ((step, 0.0), (0.0, step)))
-    write_frames(path, simulate(run, seed=6).calset, grid)
+    write_frames(path, simulate(run, seed=6).calset, raster(run, side))
 
 
 def _read_back(output: Path, line: Line, call: Call) -> None:

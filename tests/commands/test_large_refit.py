@@ -11,11 +11,11 @@ import sys
 import numpy as np
 import pytest
 from astropy.io import fits
+from frame_run import raster
 from frames_file import write_frames
 
 from walop_jax.calibration.matrix import residual_names
 from walop_jax.calibration.product import read_product, write_calibration
-from walop_jax.data.grid import Grid
 from walop_jax.likelihood import limits
 from walop_jax.reports import figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -37,10 +37,8 @@ main()
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    step = 2 * RUN.field / (SIDE - 1)
-    grid = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((step, 0.0), (0.0, step)))
     path = tmp_path_factory.mktemp("frames") / "frames.fits"
-    write_frames(path, simulate(RUN, seed=6).calset, grid, dtype="f8")
+    write_frames(path, simulate(RUN, seed=6).calset, raster(RUN, SIDE), dtype="f8")
     return path
 
 

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
+from frame_run import raster
 from frames_file import write_frames
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.commands.refit import refit
-from walop_jax.data.grid import Grid
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -32,10 +32,8 @@ class StopError(Exception):
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory) -> Path:
-    step = 2 * PLAN.field / (SIDE - 1)
-    grid = Grid(SIDE, SIDE, (1.0, 1.0), (-PLAN.field, -PLAN.field), ((step, 0.0), (0.0, step)))
     path = tmp_path_factory.mktemp("frames") / "frames.fits"
-    write_frames(path, simulate(PLAN, seed=6).calset, grid, dtype="f8")
+    write_frames(path, simulate(PLAN, seed=6).calset, raster(PLAN, SIDE), dtype="f8")
     return path
 
 

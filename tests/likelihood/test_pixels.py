@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from astropy.io import fits
-from frame_run import frame_run
+from frame_run import frame_run, raster
 from frames_file import write_frames
 
 from walop_jax.calibration import residual_map
@@ -38,9 +38,7 @@ RUN = frame_run(SIDE)
 
 
 def frames_of(calset, path, *, dtype="f4"):
-    step = 2 * RUN.field / (SIDE - 1)
-    grid = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((step, 0.0), (0.0, step)))
-    write_frames(path, calset, grid, dtype=dtype)
+    write_frames(path, calset, raster(RUN, SIDE), dtype=dtype)
     return path
 
 

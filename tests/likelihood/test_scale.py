@@ -31,13 +31,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from frame_run import raster
 from frames_file import write_frames
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import analysis_vectors
 from walop_jax.calibration.residual_map import residual_map
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.grid import Grid
 from walop_jax.data.records import Block, CalibrationSet, Intensities
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import base_model
@@ -110,14 +110,9 @@ class Made(Intensities):
         return len(self.blank.points) * EXPOSURES
 
 
-def raster(side: int) -> Grid:
-    step = 2 * RUN.field / (side - 1)
-    return Grid(side, side, (1.0, 1.0), (-RUN.field, -RUN.field), ((step, 0.0), (0.0, step)))
-
-
 def made(side: int, plan: ObservingPlan = RUN, *, from_counts: bool = False) -> CalibrationSet:
     simulated = simulate(plan, seed=3)
-    blank = dataclasses.replace(simulated.calset, points=raster(side).points)
+    blank = dataclasses.replace(simulated.calset, points=raster(RUN, side).points)
     return dataclasses.replace(
         blank, intensities=Made(blank, simulated.truth, plan.electrons, from_counts=from_counts)
     )
@@ -173,7 +168,7 @@ def test_cost_per_iteration():
 def test_whole_frames(tmp_path, side):
     """Frames on disk: fitted, with the residual map, and compressed. Writing those of 4096 × 4096 takes ten minutes."""
     path = tmp_path / "frames.fits"
-    write_frames(path, made(side), raster(side))
+    write_frames(path, made(side), raster(RUN, side))
     began = time.perf_counter()
     calset = read_calibration_set(path)
     read = time.perf_counter() - began
@@ -269,7 +264,7 @@ def test_work_per_point():
 @pytest.mark.benchmark
 def test_reading_frames(tmp_path):
     side = 512
-    write_frames(tmp_path / "frames.fits", made(side), raster(side))
+    write_frames(tmp_path / "frames.fits", made(side), raster(RUN, side))
     calset = read_calibration_set(tmp_path / "frames.fits")
     likelihood = Likelihood.of(calset, base_model(calset))
     points = MeasuredPoints(likelihood.points.reader, dataclasses.replace(likelihood.layout, kept=False))

@@ -38,6 +38,12 @@ def refitted(tmp_path_factory):
     return render(read_run(handmade_run.make_refit(tmp_path_factory.mktemp("runs") / "run")))[0]
 
 
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """For what is not about figures: drawing them takes most of the time of a page."""
+    monkeypatch.setattr(page_module, "draw", lambda name, source: Figure())
+
+
 def test_page_stands_by_itself(diagnosed, refitted):
     for text in (diagnosed, refitted):
         page = Page(text)
@@ -99,7 +105,7 @@ def test_a_long_table_is_folded_with_its_facts_and_notes(rows):
     assert [text.count(words) for words in ("clouds", "no more", "<details>")] == [1, 1, int(rows > 32)]
 
 
-def test_a_no_go_stands_first(tmp_path):
+def test_a_no_go_stands_first(tmp_path, blank_figures):
     folder = handmade_run.make_refit(tmp_path / "run")
     row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 % in 50 % of the field, 0.050 % allowed")
     shown = Display(
@@ -185,7 +191,7 @@ def test_files_of_different_diagnoses_are_not_mixed(tmp_path):
     assert "diagnosis.json is of another fit" in read_run(run).missing[1]
 
 
-def test_a_summary_with_the_necessary_keys_alone_is_enough(tmp_path):
+def test_a_summary_with_the_necessary_keys_alone_is_enough(tmp_path, blank_figures):
     run = handmade_run.make_refit(tmp_path / "run")
     keys = ("chi2", "dof", "n_data", "parameters", "converged", "message", "versions", "inputs", "shown")
     (run / "summary.json").write_text(json.dumps({key: handmade_run.SUMMARY[key] for key in keys}))
@@ -212,7 +218,7 @@ def test_patterns_without_a_name(tmp_path):
     assert "walop-jax apply" not in page.text
 
 
-def test_page_of_an_untrusted_fit(tmp_path):
+def test_page_of_an_untrusted_fit(tmp_path, blank_figures):
     misfit = {"sentences": ["mean squared residual by camera: O1 3.25"]}
     run = handmade_run.make_refit(tmp_path / "run", trusted=False, quality=8192, misfit=misfit)
     html = render(read_run(run))[0]
@@ -264,7 +270,7 @@ def test_probabilities_in_words():
     ]  # fmt: skip
 
 
-def test_a_sampled_run_shows_its_posterior(tmp_path):
+def test_a_sampled_run_shows_its_posterior(tmp_path, blank_figures):
     run = handmade_run.make_refit(tmp_path / "run")
     (run / "posterior.nc").write_bytes(b"")
     assert [s.split()[0] for s in read_run(run).missing] == [
@@ -284,7 +290,7 @@ def test_a_sampled_run_shows_its_posterior(tmp_path):
     assert page.images[-1]["src"] == "data:image/png;base64,iVBORw=="
 
 
-def test_limits_on_what_was_not_found(tmp_path):
+def test_limits_on_what_was_not_found(tmp_path, blank_figures):
     limit = {
         "effect": "ghost",
         "parameter": "share",
@@ -318,7 +324,7 @@ def test_error_that_rounds_up_to_the_next_decade_keeps_two_digits():
     assert with_error(123456.0, 1234.0) == "123500 ± 1200"
 
 
-def test_data_are_listed(tmp_path):
+def test_data_are_listed(tmp_path, blank_figures):
     text = " ".join(page_of(handmade_run.make_refit(tmp_path / "run")).text.split())
     assert "Exposures2 (2 through the polariser)" in text
     assert "Polariser angles2 modulo 180°, widest gap 135°" in text

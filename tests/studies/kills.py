@@ -38,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from commands.conftest import content  # noqa: E402
+from frame_run import raster  # noqa: E402
 from frames_file import write_frames  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 
@@ -46,7 +47,6 @@ diagnosing = importlib.import_module("walop_jax.commands.diagnose")
 from walop_jax.commands.diagnose import diagnose  # noqa: E402
 from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
-from walop_jax.data.grid import Grid  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.likelihood import limits  # noqa: E402
@@ -84,7 +84,7 @@ class Study:
         self.sets = [folder / f"set{n}.fits" for n in range(2)]
         for seed, path in enumerate(self.sets, SEED):
             if command == "compress":
-                write_frames(path, simulate(FRAMES, seed=seed).calset, raster(SIDE))
+                write_frames(path, simulate(FRAMES, seed=seed).calset, raster(FRAMES, SIDE))
             else:
                 write_calibration_set(path, simulate(SMALL, seed=seed).calset)
         self.prepare(folder)
@@ -150,12 +150,6 @@ class Study:
                 return f"the next run gives another {name}"
         extra = set(listing(self.here)) ^ set(listing(self.after))
         return f"left behind or missing: {sorted(extra)}" if extra else ""
-
-
-def raster(side: int) -> Grid:
-    """The pixels of a square detector over the whole field."""
-    step = 2 * FRAMES.field / (side - 1)
-    return Grid(side, side, (1.0, 1.0), (-FRAMES.field, -FRAMES.field), ((step, 0.0), (0.0, step)))
 
 
 def same(one: Any, other: Any) -> bool:
