@@ -199,7 +199,7 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2205,
     "science": 6110,
-    "diagnosis": 7580,
+    "diagnosis": 7600,
     "nights": 2810,
     "plans": 2305,
     "paper": 810,
