@@ -35,7 +35,9 @@ FEWEST_BLOCKS = 8
 CELLS = 6  # of the field along a side
 
 
-def robust_errors(likelihood: Likelihood, values: Vector, expansion: Expansion) -> tuple[Matrix, str]:
+def robust_errors(
+    likelihood: Likelihood, values: Vector, expansion: Expansion
+) -> tuple[Float[np.ndarray, "f f"], str]:
     """Covariance of the free parameters from the residuals at a minimum, and its origin in words.
 
     `expansion` is the expansion there, `values` a full vector.
