@@ -18,6 +18,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.nights import making
 from walop_jax.nights.equations import SIDEREAL
 from walop_jax.nights.making import executor_of
 from walop_jax.nights.stacking import stack
@@ -65,6 +66,17 @@ def test_threads_make_the_same_survey(given, here, tmp_path):
     with ThreadPoolExecutor(1) as executor:
         assert_identical(stack(given, executor=executor, partial=tmp_path), here)
     assert len(list(tmp_path.glob("night-*.fits"))) == len(given)
+
+
+def test_another_process_is_set_up_as_a_command_is(monkeypatch):
+    """Without kept programs every worker would compile its own, for as long as twenty nights take."""
+    switched = []
+    monkeypatch.setattr(making, "switch_on", lambda: switched.append(True))
+    making._prepare.cache_clear()
+    making._prepare(os.getpid(), ())
+    assert not switched
+    making._prepare(-1, ())
+    assert switched
 
 
 @pytest.mark.long
