@@ -25,8 +25,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -423,22 +424,27 @@ def off(survey, mjd, form, names, reference, true) -> tuple[float, np.ndarray]:
     return float(np.sqrt(np.mean(error**2))), error / sigma
 
 
-def command(*arguments: object, kill_after: float | None = None) -> tuple[float, float, float]:
-    """CPU seconds, memory (GB) and wall time of a command in a process of its own, killed after a time (s)."""
-    began = time.perf_counter()
+def command(*arguments: object, kill_when: Callable[[], bool] | None = None) -> tuple[float, float, float]:
+    """CPU seconds, memory (GB) and wall time of a command in a process of its own, killed when something is so."""
+    began, ended = time.perf_counter(), threading.Event()
     child = subprocess.Popen(
         [sys.executable, "-m", "walop_jax", *map(str, arguments), "--quiet"], start_new_session=True
     )
-    watch = (
-        None if kill_after is None else threading.Timer(kill_after, os.killpg, (child.pid, signal.SIGKILL))
-    )
-    if watch is not None:
+
+    def kill() -> None:
+        assert kill_when is not None
+        while not kill_when():
+            if ended.wait(0.02):
+                return
+        os.killpg(child.pid, signal.SIGKILL)
+
+    watch = threading.Thread(target=kill)
+    if kill_when is not None:
         watch.start()
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
-    if watch is not None:
-        watch.cancel()
-    elif child.returncode not in (0, 3):
+    ended.set()
+    if kill_when is None and child.returncode not in (0, 3):
         raise SystemExit(f"{' '.join(map(str, arguments))}: exit code {child.returncode}")
     return used.ru_utime + used.ru_stime, used.ru_maxrss / 1e6, time.perf_counter() - began
 
@@ -484,7 +490,7 @@ def passes(count: int, start: int = 0) -> None:
     (folder / "laws.toml").write_text(f'[law."throughput.n?.p00"]\nper = "walk"\nrate = {RATE}\n')
     command("refit", files[0], "-o", folder / "RUN")
 
-    def stacked(output: str, *words: str, nights: int = count, **more: float) -> tuple[float, float, float]:
+    def stacked(output: str, *words: str, nights: int = count, **more: Any) -> tuple[float, float, float]:
         like, laws = folder / "RUN", folder / "laws.toml"
         return command(
             "stack", *files[:nights], "--like", like, "--laws", laws, "-o", folder / output, *words, **more
@@ -513,11 +519,14 @@ def passes(count: int, start: int = 0) -> None:
     command("refit", folder / "one.fits", "-o", folder / "COLD1")  # keeps its programs, as those above
     alike, size, _ = command("refit", folder / "one.fits", "-o", folder / "ONE")
     print(f"  one set as large: {alike:.1f} s of CPU, {size:.2f} GB: ratio {used / alike:.2f}", flush=True)
-    rng = np.random.default_rng(start)
-    for kill in range(KILLS):  # by turns one process, and two workers whose parent dies
-        # Behind the start of a process; what is made is not made again.
-        after = float(rng.uniform(0.15, 0.25) * wall)
-        stacked("KILLED", *(("--workers", "2") if kill % 2 else ()), kill_after=after)
+    made = (folder / "KILLED" / "partial").glob
+    for kill in range(KILLS):  # by turns one process, and two workers whose parent dies, after one night more
+        there = len(list(made("night*")))
+        stacked(
+            "KILLED",
+            *(("--workers", "2") if kill % 2 else ()),
+            kill_when=lambda there=there: len(list(made("night*"))) > there,
+        )
     left = len(list((folder / "KILLED" / "partial").glob("night*")))
     more, _, _ = stacked("KILLED")
     print(
