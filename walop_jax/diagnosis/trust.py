@@ -162,12 +162,12 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
                 for p in group
             ]
             joined = np.concatenate(columns, axis=1)
-            products = basis[:count].T @ joined, joined.T @ residual[:count]
+            along, scores = basis[:count].T @ joined, joined.T @ residual[:count]
             drawn, last = joined.T.astype(np.float32) @ normal[:count], 0
             for c in columns:
                 at = slice(last, last := last + c.shape[1])
-                square, along = c.T @ c, products[0][:, at]
-                blocks.append((np.diag(square), products[1][at], drawn[at], square - along.T @ along))
+                square, part = c.T @ c, along[:, at]
+                blocks.append((np.diag(square), scores[at], drawn[at], square - part.T @ part))
         scored += shown
     if not scored:
         return ScoreTable((), noise, 1.0, 1.0)

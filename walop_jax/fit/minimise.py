@@ -151,9 +151,9 @@ def minimise(
         (RESULTS.conlim, f"parameters cannot be distinguished: condition number {condition:.1e}"),
         (RESULTS.stagnation, f"no step lowers χ² any more, {reached}"),
         (RESULTS.nonfinite, "the model is not finite at the start values"),
-        (RESULTS.nonlinear_max_steps_reached, f"not converged after {steps} steps, {reached}"),
     )
-    message = next(text for outcome, text in messages if bool(result == outcome))
+    unfinished = f"not converged after {steps} steps, {reached}"
+    message = next((text for outcome, text in messages if bool(result == outcome)), unfinished)
     return Minimum(x, current, result, message, steps, distance, condition, tuple(history))  # pyright: ignore[reportArgumentType]
 
 

@@ -319,16 +319,13 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         what = f"χ²/dof = {ratio:.4g} with nothing but noise in the residuals: the stated errors N_ERR are"
         yield Doubt(excess, f"{what} {100 * (np.sqrt(ratio) - 1):.2g} % too small", blocking=False)
     elif not result.explains_data:
-        text = (
-            f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected; do not use this"
-        )
-        text += " calibration (walop-jax diagnose looks for missing effects)"
-        yield Doubt(Quality.UNEXPLAINED | excess, text)
+        what = f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected"
+        advice = "do not use this calibration (walop-jax diagnose looks for missing effects)"
+        yield Doubt(Quality.UNEXPLAINED | excess, f"{what}; {advice}")
     elif result.errors_too_large and not noiseless:
-        what = (
-            f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N; check the gain, and whether N_ERR"
-        )
-        yield Doubt(Quality.ERRORS_TOO_LARGE, f"{what} holds variances or other units")
+        what = f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N"
+        advice = "check the gain, and whether N_ERR holds variances or other units"
+        yield Doubt(Quality.ERRORS_TOO_LARGE, f"{what}; {advice}")
     elif excess:
         yield Doubt(excess, "", blocking=False)  # so few degrees of freedom that noise alone may do it
     if result.noise_scale > 1.0:

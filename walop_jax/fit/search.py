@@ -244,8 +244,8 @@ def check_identifiable(likelihood: Likelihood) -> None:
         advice = "a fit of the instrument needs at least 3, better 8 or more spread over 360°"
         raise fail(what, file=inputs, extension="EXPOSURES", column="CLP_ANGLE", advice=advice)
     if likelihood.layout.points < 2 and likelihood.model.template.throughput.degree > 0:
-        advice = "the throughput over the field needs several; write degree = 0 under [throughput] of the"
-        advice += " instrument file, or give more points"
+        remedy = "write degree = 0 under [throughput] of the instrument file, or give more points"
+        advice = f"the throughput over the field needs several; {remedy}"
         raise fail("a single field point", file=inputs, extension="POINTS", advice=advice)
 
 

@@ -425,8 +425,9 @@ class ResponseBlock:
             return self._pairs(responses.counts * cameras) * self.share * self.flux
         if stage == "opposite":
             return self._alone(responses.opposite * cameras) * self.flux
-        added = responses.added | {"median": np.broadcast_to(self.of.median, responses.electrons.shape)}
-        return self._alone(added[stage] * cameras) * (self.weight if self.linear else 1.0)
+        shape = responses.electrons.shape
+        added = np.broadcast_to(self.of.median, shape) if stage == "median" else responses.added[stage]
+        return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:
         """Values that enter once, for any number of sites."""

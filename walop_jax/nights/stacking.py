@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import itertools
 import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -125,17 +126,16 @@ def stack(
             breaks += new_breaks
         before = data.reference
         data, solution, settled = _settled(data, chosen, at_hand, makers)
-        with_laws = zip(data.names, chosen, strict=True)
-        moving = [name for name, law in list(with_laws)[len(chosen) - data.candidates :] if law is not None]
-        if at_hand and moving:
-            # Their columns are those of where the nights were, as far as they do not follow the parameters: what that
-            # leaves is a product of the way since and of their amplitudes.
+        moving = ~data.has_value & np.array([law is not None for law in chosen])
+        if at_hand and moving.any():
+            # Columns of candidates are those of where the nights were, as far as they do not follow the parameters:
+            # the error is a product of the distance since and of their amplitudes.
             values, sigma = _in_units(data, solution)
-            ways = _farthest(data, solution, before, at_hand)
-            at = [data.names.index(name) for name in moving]
-            sizes = 1.0 + np.abs(values / sigma)[:, at].sum(axis=1)
-            order = sorted(ways, key=lambda u: -ways[u] * sizes[u])
-            data, *_ = _linearised(data, solution, chosen, order, at_hand, makers, frozenset(moving))
+            distance = _distances(data, solution, before, at_hand)
+            sizes = 1.0 + np.abs(values / sigma)[:, moving].sum(axis=1)
+            order = sorted(distance, key=lambda u: -distance[u] * sizes[u])
+            names = frozenset(itertools.compress(data.names, moving))
+            data, *_ = _linearised(data, solution, chosen, order, at_hand, makers, names)
             data, solution, settled = _settled(data, chosen, at_hand, makers)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
@@ -253,7 +253,7 @@ def _settled(
     """
     solution, anew, enough, farthest = solved(data, laws), list[int](), False, np.inf
     for _ in range(ROUNDS):
-        away = _farthest(data, solution, data.reference, at_hand)
+        away = _distances(data, solution, data.reference, at_hand)
         again = {u: distance for u, distance in away.items() if distance > FAR}
         if not again or (enough and not set(again) & set(anew)):
             return data, solution, True
@@ -264,16 +264,16 @@ def _settled(
     return data, solution, False
 
 
-def _farthest(
+def _distances(
     data: Together,
     solution: Solution,
-    places: Float[np.ndarray, "u n"],
+    references: Float[np.ndarray, "u n"],
     at_hand: Mapping[tuple[str, int], Data],
 ) -> dict[int, float]:
-    """Distances (standard errors) of nights whose data are at hand from places to the solution, the farthest first."""
+    """Distances (standard errors) of nights whose data are at hand, from references to a solution, largest first."""
     values, sigma = _in_units(data, solution)
     # Candidates have no place in the model: their part stays first-order, at 0.
-    away = (np.abs(values - places) / sigma)[:, data.has_value].max(axis=1)
+    away = (np.abs(values - references) / sigma)[:, data.has_value].max(axis=1)
     order = np.argsort(-away, kind="stable").tolist()
     return {u: float(away[u]) for u in order if data.nights[u].key in at_hand}
 
@@ -287,7 +287,7 @@ def _linearised(
     makers: Makers,
     candidates: frozenset[str] = frozenset(),
 ) -> tuple[Together, Solution, list[int], bool]:
-    """Linearise nights `again` at a solution, with candidates: which were, and whether the rest may stay as they are.
+    """Linearise nights `again` at a solution, with candidates, until the rest may stay; which were, and whether it may.
 
     They come in their order, the n-th of them to see: were each of the rest as far from linear, how far would all
     together move the solution? Up to `EXACT` errors the rest stays.
@@ -303,7 +303,7 @@ def _linearised(
         for u, (night,) in zip(batch, earlier, strict=False):
             nights[u] = night
         seeing = len(batch) == max(1, begin)  # the first, second, fourth …: solving costs time as well
-        before, _ = _in_units(data, solution)
+        before = values
         if seeing and begin > 0:
             before, _ = _in_units(trial := together(nights), solved(trial, laws))
         nights[u := batch[-1]] = last
