@@ -9,8 +9,8 @@ import numpy as np
 from small_run import SMALL
 
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
+from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import Diagnosis, Step
 from walop_jax.diagnosis.hypotheses import Hypotheses
@@ -38,7 +38,7 @@ def told() -> tuple[FitResult, Context, Any]:
         if probe.name.startswith("gain of")
     ]
     state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    return result, context, classes_of(state, context, {Described.name}, [TOLD])
+    return result, context, ambiguities(state, context, {Described.name}, [TOLD])
 
 
 @functools.cache

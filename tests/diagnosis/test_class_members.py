@@ -13,8 +13,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
+from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
@@ -105,7 +105,7 @@ def test_what_was_added_is_in_its_class_once():
         if probe.name in (own, other)
     ]
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(sentences=said), np.random.default_rng(0))
-    (found,) = classes_of(state, context, {Described.name}, [own]).additions
+    (found,) = ambiguities(state, context, {Described.name}, [own]).additions
     assert [member.name for member in found.members] == [own, other]
 
 

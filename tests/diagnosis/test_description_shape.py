@@ -11,8 +11,8 @@ from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
-from walop_jax.diagnosis.class_members import classes_of, shape_changes
 from walop_jax.diagnosis.class_product import averaged, only_a_class
+from walop_jax.diagnosis.discrepancy import ambiguities, shape_changes
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model, model_like
@@ -40,7 +40,7 @@ def described():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([TEXT], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    return state, context, classes_of(state, context, {Described.name}, [TEXT])
+    return state, context, ambiguities(state, context, {Described.name}, [TEXT])._replace(undetected=None)
 
 
 def test_patterns_are_all_polynomials_to_the_third_degree():
@@ -146,7 +146,7 @@ def test_a_hidden_deviation_is_recovered_with_its_sign():
         )
         for t in ([TEXT], [TEXT, other])
     )
-    shape = classes_of(
+    shape = ambiguities(
         examine(one, Hypotheses(), np.random.default_rng(0)), context, {Described.name}, [TEXT]
     ).shape
     j = [total[0][1].text for total in shape.deviations.sums].index(other)
@@ -222,7 +222,8 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    classes = classes_of(state, context, {Described.name}, [text])
+    classes = ambiguities(state, context, {Described.name}, [text])
     assert classes.shape.on_stars == ()
-    product = averaged(Calibration.from_fit(state.result.judged()), classes._replace(additions=()), context)
+    alone = classes._replace(additions=(), undetected=None)
+    product = averaged(Calibration.from_fit(state.result.judged()), alone, context)
     assert "deviations" not in product.model.effect_names

@@ -19,8 +19,8 @@ from studies.sealed_optics import Hidden
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import averaged
+from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
@@ -48,7 +48,7 @@ def judged(seed: int) -> sealed.Judged:
     every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
     state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
-    classes = classes_of(state, context, {Described.name}, [TOLD])
+    classes = ambiguities(state, context, {Described.name}, [TOLD])
     return sealed.judged(averaged(Calibration.from_fit(result), classes, context), True, one)
 
 

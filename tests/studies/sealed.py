@@ -449,7 +449,7 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
         after,
         verdict,
         found.p_value,
-        bool(found.members),
+        found.members.several,
         time.process_time() - began,
         right_of(one, found),
     )

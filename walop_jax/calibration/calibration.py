@@ -46,8 +46,9 @@ from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, nearest
 from walop_jax.io.text import in_ascii
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.dependence import left_behind, needs
-from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
@@ -248,11 +249,24 @@ class Calibration(Contents, Fitted):
         )
         return calibration if result.averaged is None else result.averaged(calibration)
 
-    def with_covariance(self, covariance: Matrix, errors_from: str) -> Calibration:
-        """The calibration with the covariance of a posterior, made of errors from `errors_from`, as made now."""
+    def with_covariance(self, covariance: Float[np.ndarray, "f f"], errors_from: str) -> Calibration:
+        """The calibration with the covariance of a posterior of its fit, made of errors from `errors_from`, now."""
         verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
         made = {"date": now(), "versions": software_versions()}
-        return dataclasses.replace(self, covariance=covariance, verdict=verdict, **made)
+        return dataclasses.replace(self, covariance=self.widened(covariance), verdict=verdict, **made)
+
+    @property
+    def fitted(self) -> Int[np.ndarray, " f"]:
+        """Positions of the parameters of the fit: all but deviations, which a diagnosis adds."""
+        return np.delete(np.arange(len(self.model.names)), self.model.positions(Deviations.name))
+
+    def widened(self, covariance: Float[np.ndarray, "f f"]) -> Matrix:
+        """The covariance of all parameters, from another one of the parameters of the fit."""
+        at, fitted = self.model.positions(Deviations.name), self.fitted
+        across = self.covariance[:, at]
+        total = across @ pseudo_inverse(self.covariance[np.ix_(at, at)], 1e-12) @ across.T
+        total[np.ix_(fitted, fitted)] += covariance
+        return total
 
     @property
     def instrument(self) -> str:

@@ -110,7 +110,7 @@ def _sampled_run(
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT
     from walop_jax.io.plain_tables import write_table
-    from walop_jax.posterior.draws import digest_of_fit
+    from walop_jax.posterior.draws import digest_of
     from walop_jax.posterior.files import Chain, write_posterior
     from walop_jax.posterior.sampling import sample as sample_fit
     from walop_jax.reports.named import draw
@@ -134,8 +134,9 @@ def _sampled_run(
         if job.overwrite and not resume:
             Chain(folder / CHAINS, {}).path.unlink(missing_ok=True)
         posterior = sample_fit(result, options, folder=folder / CHAINS, resume=resume, report=tell)
-        fitted = digest_of_fit(product.inputs, product.model.names, product.values)
-        posterior = dataclasses.replace(posterior, of_trusted_fit=product.verdict.trusted, fit=fitted)
+        posterior = dataclasses.replace(
+            posterior, of_trusted_fit=product.verdict.trusted, fit=digest_of(product)
+        )
         document = posterior.document() | {"shown": posterior.display().document()}
         intervals, figures = posterior.to_table(), FigureSource.of(posterior)
         with out.filled(((PRODUCT,) if posterior.trusted else ()) + OUTPUTS) as temporary:

@@ -11,16 +11,6 @@ Kinds        An effect in exposures of one KIND is a difference between that KIN
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
              Equivalent members count once. The product is their mean, and its covariance has their spread: values and
              covariance of a model that includes all of them, each amplitude 0 in the models of the others.
-Shape        A description without a name is the simplest one that explains the data: a polynomial over the field, one
-             law over the exposures, one kind of polarisation. Its cause has no reason to be so simple. Deviations from
-             it are a Gaussian process, marginalised by one linear step,
-                 δ(x, t) = Σ_j c_j f_j(x, t),   c_j ~ N(0, s²/(n ⟨f_j²⟩))
-             f_j products of a pattern over the field (all polynomials to the third degree), a law over the exposures
-             (none, those of the descriptions, other slow ones) for each kind of polarisation (`GENERATORS`; of cameras
-             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
-             laws: every kind may be as large as what was described, in any shape. In a product, stars have those
-             without a dependence and with those described; others change the parameters alone. Source: model
-             discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425
 Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
              no part in it.
 """
@@ -31,7 +21,6 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,22 +30,17 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Classes, ClassOf, Likeness, Shape, Sum, distinct
+from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
 from walop_jax.diagnosis.exact import signature
 from walop_jax.diagnosis.examination import Examination
-from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
 from walop_jax.fit.refit import FitResult
-from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
-from walop_jax.model.effects import Context, Described, FreeForm
-from walop_jax.model.effects.change import AMPLITUDES, KINDS, SINGLE, SLOW, InExposures, patched
+from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.effects.deviations import CUBIC
-from walop_jax.model.effects.optics import GENERATORS, generators_of
-from walop_jax.model.light import mean_wavelengths
 
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
@@ -65,24 +49,14 @@ PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
-    state: Examination,
-    context: Context,
-    names: Collection[str],
-    groups: Sequence[str],
-    alike: Collection[str] = (),
-) -> Classes:
-    """The classes of the effects of a model that have some names, and deviations from the shapes of its descriptions.
+    laid: Laid, context: Context, names: Collection[str], groups: Sequence[str]
+) -> tuple[ClassOf, ...]:
+    """The classes of the effects of a model that have some names, without those of a single member.
 
-    Without classes of a single member. `groups` are the names of the added groups of sentences, `alike` the effects and
-    groups reported as indistinguishable: with large residuals, where one linear step is inaccurate, they count as
-    probable.
+    `groups` are the names of the added groups of sentences.
     """
-    additions = list(_additions(state.result, context, names, groups))
-    if not additions or not state.result.model.template.cameras.pairs:
-        return Classes()
-    laid = _Laid(state, alike)
-    ambiguous = (addition for addition in itertools.starmap(laid.class_of, additions) if addition.names)
-    return Classes(tuple(ambiguous), laid.shape())
+    classes = itertools.starmap(laid.class_of, _additions(laid.fit, context, names, groups))
+    return tuple(addition for addition in classes if addition.names)
 
 
 def _additions(
@@ -122,8 +96,12 @@ def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, ...
     yield from ((text,) for text in ungrouped)
 
 
-class _Laid:
-    """An examination laid out for one linear step from model to model."""
+class Laid:
+    """An examination laid out for one linear step from model to model.
+
+    `alike` are effects and groups reported as indistinguishable from additions: with large residuals, where one linear
+    step is inaccurate, they count as probable.
+    """
 
     def __init__(self, state: Examination, alike: Collection[str]) -> None:
         self.alike = alike
@@ -155,7 +133,7 @@ class _Laid:
 
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
-        step = _Step(self, at, lost)
+        step = Step(self, at, lost)
         addition = step.addition(name, sums)
         # The addition is among the candidates: it is no further member.
         rivals = (
@@ -177,33 +155,6 @@ class _Laid:
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
-    def shape(self) -> Shape | None:
-        """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
-        if FreeForm.name in self.fit.model.effect_names:  # it has every shape
-            return None
-        changes, widths, laws = shape_changes(self.fit, self.columns)
-        if not changes:
-            return None
-        sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
-        step = _Step(self, np.zeros(0, int), np.zeros(self.design.rows))
-        column = self.design.stacked([self.columns.of(sums)])
-        likeness = step.member("", sums, column, widths, 0.0)
-        vectors, added = self.added(sums)
-        pairs = self.template.cameras.pairs
-        slopes = np.moveaxis(of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), pairs), 1, -1)
-        slopes = slopes.reshape(*self.matrix.shape, -1) + self.slopes @ likeness.slopes
-        between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
-        between += likeness.change[:, :, None] * likeness.change[:, None, :]
-        # At another temperature stars have terms that are zero in the usual setting.
-        steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
-        _, at_any = self.added([((1.0, change),) for change in steady])
-        acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
-        # Of other dependences than those described stars have none: each is a program's worth of derivatives.
-        on_stars = tuple(
-            j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws
-        )
-        return Shape(likeness, on_stars, self._error_of_p(between), self.stated)
-
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
@@ -213,14 +164,14 @@ class _Laid:
         total = np.sqrt(self.errors**2 + np.diagonal(between, axis1=1, axis2=2))
         far = np.median(np.abs(away) / np.where(total > 0, total, np.inf), axis=1).max(axis=1)
         off = float(far[weights > PLAUSIBLE].max(initial=0.0))
-        return self._error_of_p(between), self.stated, off
+        return self.error_of_p(between), self.stated, off
 
     @functools.cached_property
     def stated(self) -> float:
         """Error of p of stars from the covariance of the fit."""
-        return self._error_of_p(self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2))
+        return self.error_of_p(self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2))
 
-    def _error_of_p(self, square: Float[np.ndarray, "p m m"]) -> float:
+    def error_of_p(self, square: Float[np.ndarray, "p m m"]) -> float:
         """Error of p of stars from a covariance of the matrix: median over the field."""
         if self.matrix.shape[1] == 6:
             good = measures_u(self.matrix.reshape(-1, 2, 3))
@@ -230,10 +181,10 @@ class _Laid:
         return float(np.median(errors)) if errors.size else 0.0
 
 
-class _Step:
+class Step:
     """One linear step from the fit to a model without some amplitudes and with others."""
 
-    def __init__(self, laid: _Laid, at: Int[np.ndarray, " a"], lost: Vector) -> None:
+    def __init__(self, laid: Laid, at: Int[np.ndarray, " a"], lost: Vector) -> None:
         self.laid, self.at = laid, at
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
@@ -364,93 +315,3 @@ def _texts(sums: Sequence[Sum]) -> set[str]:
 def covariance_of_free(fit: FitResult) -> Matrix:
     """Covariance of the free parameters of a fit."""
     return fit.covariance[np.ix_(fit.model.free, fit.model.free)]
-
-
-# ------------------------------------------------------------------------------ deviations from a description
-
-_OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
-
-
-class _Place(NamedTuple):
-    """Changes of one kind of quantity at one place."""
-
-    kinds: tuple[str, ...]
-    where: str
-    place: str
-    origin: str
-
-
-def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vector, set[tuple[str, ...]]]:
-    """Deviations from the shapes of the descriptions in a model, their prior widths, and the laws described."""
-    instrument = fit.model.instrument(fit.values)
-    if not any(isinstance(effect, Described) for effect in instrument.effects):
-        return [], np.zeros(0), set()
-    described = instrument.effect(Described.name)
-    assert isinstance(described, Described)
-    data, squares = _AtData.of(columns), dict[_Place, float]()
-    laws: dict[_Place, dict[tuple[str, ...], None]] = {}
-    for change, amplitude in described.terms():
-        optical = change.kind.partition(" ")[0] in _OPTICS
-        place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
-        parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
-        for _, coefficient, factors in parts:
-            size = float(amplitude) * coefficient * data.rms(change.times(*factors))
-            squares[place] = squares.get(place, 0.0) + size**2
-        laws.setdefault(place, {(): None}).setdefault(change.beside_field)
-    listed = set(described.sentences)
-    changes, widths = list[Sentence](), list[float]()
-    for place, square in squares.items():
-        shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
-        count = len(shapes) / len(place.kinds)
-        for change in shapes:
-            rms = data.rms(change)
-            if change.text not in listed and square * rms > 0.0:
-                changes.append(change)
-                widths.append(np.sqrt(square / max(count, 1.0)) / rms)
-    return changes, np.array(widths), set().union(*laws.values())
-
-
-def _shapes(
-    place: _Place, laws: Sequence[tuple[str, ...]], fit: FitResult, columns: Columns
-) -> Iterator[Sentence]:
-    """All changes of a place with some laws, and other slow ones, that the model can include.
-
-    Steady gains are those of the throughput; other steady numbers have the first four patterns.
-    """
-    exposures, template = fit.calset.exposures, fit.model.template
-    over_field = len(fit.calset.points) >= FEWEST_POINTS
-    dependences = Dependences(exposures, over_field, (), np.ones(len(exposures), bool))
-    slow = [law for form in (*SLOW, *SINGLE) for law in dependences.of(form)] if len(laws) > 1 else []
-    for law in dict.fromkeys((*laws, *slow)):
-        patterns = CUBIC if law or place.kinds == GENERATORS else CUBIC[:4]
-        for pattern, kind in itertools.product(patterns if over_field else CUBIC[:1], place.kinds):
-            change = Sentence(kind, place.where, place.place, (*pattern, *law), place.origin)
-            try:
-                change.check_factors(template)
-            except ValueError:
-                continue
-            if columns.has(((1.0, change),)) and (law or kind != "gain"):
-                yield change
-
-
-@dataclasses.dataclass(frozen=True)
-class _AtData(InExposures):
-    """The (point, exposure) of a set; `wavelength` (µm) is the mean of the band of each exposure."""
-
-    wavelength: Any = 0.0
-    used: Any = None
-
-    @classmethod
-    def of(cls, columns: Columns) -> Self:
-        """Those of a likelihood."""
-        points, plan = columns.likelihood.calset.points, columns.plan
-        of_bands = np.asarray(mean_wavelengths(columns.patched, plan))
-        wavelength = of_bands[np.asarray(plan.band_of)[:, 0]]
-        return cls(
-            columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
-        )
-
-    def rms(self, change: Sentence) -> float:
-        """Root mean square of the factors of a change."""
-        sizes = np.nan_to_num(np.asarray(change.factor(self), float))
-        return float(np.sqrt(np.mean(np.broadcast_to(sizes, self.used.shape)[self.used] ** 2)))

@@ -89,35 +89,55 @@ class Shape(NamedTuple):
     spread: float
     stated: float
 
-    def effect(self, context: Context) -> Deviations:
-        """The effect that includes these, all zero."""
-        changes = [self.deviations.sums[j][0][1] for j in self.on_stars]
-        places = [
-            " * ".join((f"{change.where} {change.place}", *change.beside_field))
-            for change in changes
-            if change.kind in GENERATORS
-        ]
-        others = [change.text for change in changes if change.kind not in GENERATORS]
-        return Deviations.of(context, places=dict.fromkeys(places), sentences=others)
-
 
 class Classes(NamedTuple):
-    """Ambiguities of a diagnosis: classes of its additions that have other members, and shapes of descriptions."""
+    """Ambiguities of a diagnosis: classes of its additions that have other members, shapes of its descriptions.
+
+    `undetected` are changes that the data would not show: of those only the errors are in the product.
+    """
 
     additions: tuple[ClassOf, ...] = ()
     shape: Shape | None = None
+    undetected: Shape | None = None
 
     def __bool__(self) -> bool:
+        return self.several or self.undetected is not None
+
+    @property
+    def several(self) -> bool:
+        """True if the product is a mean over models."""
         return bool(self.additions) or self.shape is not None
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """What is in the product as `Deviations`."""
+        return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
+
+    def deviations(self, context: Context) -> Deviations | None:
+        """The effect that includes all that acts on stars, zero; None if nothing does."""
+        changes = [shape.deviations.sums[j][0][1] for shape in self.shapes for j in shape.on_stars]
+        described = (
+            [] if self.shape is None else [self.shape.deviations.sums[j][0][1] for j in self.shape.on_stars]
+        )
+        places = dict.fromkeys(_place(change) for change in described if change.kind in GENERATORS)
+        others = [
+            change.text for change in changes if change.kind not in GENERATORS or _place(change) not in places
+        ]
+        return Deviations.of(context, places=places, sentences=others) if changes else None
+
+
+def _place(change: Sentence) -> str:
+    """Place and dependence of a change of polarisation, as `Deviations` lists it."""
+    return " * ".join((f"{change.where} {change.place}", *change.beside_field))
 
 
 def with_average(result: FitResult, classes: Classes) -> FitResult:
-    """The fit whose calibration is the mean over the classes of its additions."""
+    """The fit whose calibration is the mean over the classes of its additions, with all that may be undetected."""
     if not classes:
         return result
     context = effect_context(result.model.template, result.calset.exposures)
     mean = functools.partial(averaged, classes=classes, context=context)
-    return dataclasses.replace(result, averaged=mean)
+    return dataclasses.replace(result, averaged=mean, mean_of_models=classes.several)
 
 
 def averaged(calibration: Calibration, classes: Classes, context: Context) -> Calibration:
@@ -158,19 +178,19 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         mean, average = mixture(weights, np.stack(means), errors)
         values += mean - start
         covariance += average - fitted
-    if classes.shape is not None:  # the descriptions remain: their parameters are as free as before
-        deviations, acting = classes.shape.deviations, classes.shape.on_stars
-        sums = [total if j in acting else () for j, total in enumerate(deviations.sums)]
+    for shape in classes.shapes:  # the model that was fitted remains: its parameters are as free as before
+        deviations = shape.deviations
+        sums = [total if j in shape.on_stars else () for j, total in enumerate(deviations.sums)]
         amplitudes = _derivatives(model, Deviations.name, sums)
         slopes = into @ deviations.slopes + amplitudes
         values += into @ deviations.values + amplitudes @ deviations.amplitudes
         covariance += slopes @ deviations.covariance @ slopes.T
-        # Held at their values: fits of other data would not constrain them.
-        held = [
-            dataclasses.replace(p, free=False, start=float(value)) if p.part == Deviations.name else p
-            for p, value in zip(model.parameters, values, strict=True)
-        ]
-        model = dataclasses.replace(model, parameters=tuple(held))
+    # Held at their values: fits of other data would not constrain them.
+    held = [
+        dataclasses.replace(p, free=False, start=float(value)) if p.part == Deviations.name else p
+        for p, value in zip(model.parameters, values, strict=True)
+    ]
+    model = dataclasses.replace(model, parameters=tuple(held))
     hidden = calibration.hidden
     if hidden is not None:
         changes = np.zeros((len(hidden), count))
@@ -191,8 +211,8 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
         for _, sentence in amplitude
     )
     model = calibration.model
-    if classes.shape is not None and classes.shape.on_stars:
-        model = with_effects(model, [classes.shape.effect(context)], context)
+    if (effect := classes.deviations(context)) is not None:
+        model = with_effects(model, [effect], context)
     if not texts:
         return model
     description = Described.saying(list(texts), np.zeros(len(texts)))

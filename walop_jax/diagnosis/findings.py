@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Classes
+from walop_jax.diagnosis.class_product import Classes, Shape
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -495,12 +495,8 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for addition in diagnosis.members.additions
         ],
-        "shape": (shape := diagnosis.members.shape)
-        and {
-            "deviations": len(shape.deviations.sums),
-            "spread_of_p": shape.spread,
-            "stated_error_of_p": shape.stated,
-        },
+        "shape": _shape(diagnosis.members.shape),
+        "undetected": _shape(diagnosis.members.undetected),
         "cannot_be_tested": diagnosis.untestable,
         "chi2_per_dof_before": before.chi2 / max(before.dof, 1),
         "chi2_per_dof_after": after.chi2 / max(after.dof, 1),
@@ -512,3 +508,14 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "seconds": diagnosis.seconds,
     }
     return plain(content)
+
+
+def _shape(shape: Shape | None) -> dict[str, Any] | None:
+    """The entry of deviations that are in the product."""
+    if shape is None:
+        return None
+    return {
+        "deviations": len(shape.deviations.sums),
+        "spread_of_p": shape.spread,
+        "stated_error_of_p": shape.stated,
+    }

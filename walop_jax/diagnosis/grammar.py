@@ -158,7 +158,7 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
     """All changes that fit the instrument and are visible in the exposures."""
     polariser, sky = instrument.polariser, ~exposures.clp_in
     groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
-    for places in _places(instrument, exposures):
+    for places in places_of(instrument, exposures):
         inside = sky if polariser is not None and places == [("ahead of", polariser.name)] else None
         anything = [_base(GENERATORS, *place) for place in places]
         for number, group in enumerate(groups):
@@ -184,7 +184,7 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
         yield Subject.of(_base(OF_QU, "of", name.replace(" ", "_")))
 
 
-def _places(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:
+def places_of(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:
     """Places between elements that act on polarisation: preposition and element; equal names in all arms together."""
     train, polariser, arms = list(instrument.train()), instrument.polariser, instrument.arms
     behind = train[len(instrument.telescope()) + (polariser is not None) :]

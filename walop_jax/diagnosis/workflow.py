@@ -23,8 +23,8 @@ import numpy as np
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_members import classes_of
 from walop_jax.diagnosis.class_product import only_a_class, with_average
+from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import (
@@ -143,7 +143,7 @@ def diagnose(
         ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
-        members=classes_of(evidence, context, set(added), groups, alike),
+        members=ambiguities(evidence, context, set(added), groups, alike),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),

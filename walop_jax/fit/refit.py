@@ -56,7 +56,8 @@ class FitResult(Fitted):
     `errors_from` is the source of the covariance, the stated errors of the data (`STATED`) or residuals; `hidden`
     are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
     are known with it (`science.field_accuracy.answered`), which is shown first. `averaged` makes of its calibration the
-    mean over models that its data cannot tell apart (`diagnosis.class_product`); None where there is one model alone.
+    product of a diagnosis (`diagnosis.class_product`), `mean_of_models` if that is a mean over models that its data
+    cannot tell apart.
 
     >>> result.value("pupil.magnification")[0].__round__(2)
     15.67
@@ -75,6 +76,7 @@ class FitResult(Fitted):
     hidden: Hidden | None = None
     answer: Callable[[], Any] | None = None
     averaged: Callable[[Any], Any] | None = None
+    mean_of_models: bool = False
 
     @classmethod
     def of(cls, likelihood: Likelihood, *, noise_scale: float | None = None) -> FitResult:

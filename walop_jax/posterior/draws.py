@@ -117,17 +117,31 @@ def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Flo
 
 def with_draws(calibration: Calibration, path: Any, count: int = DRAWS) -> Calibration:
     """The calibration with `count` draws of a posterior, a file or in memory, over which its matrices are averaged."""
-    draws = _draws_of(calibration, path)
-    chosen = np.random.default_rng(0).permutation(len(draws))[:count]
-    return dataclasses.replace(calibration, draws=draws[chosen])
+    draws, rng = _draws_of(calibration, path), np.random.default_rng(0)
+    chosen, fitted = rng.permutation(len(draws))[:count], calibration.fitted
+    # Deviations that a diagnosis adds are independent of the fit.
+    value, vector = np.linalg.eigh(calibration.widened(np.zeros((len(fitted), len(fitted)))))
+    normal = rng.standard_normal((len(chosen), len(value)))
+    whole = calibration.values + normal @ (vector * np.sqrt(np.clip(value, 0.0, None))).T
+    whole[:, fitted] += draws[chosen] - calibration.values[fitted]
+    return dataclasses.replace(calibration, draws=whole)
 
 
 def with_moments(calibration: Calibration, path: Any) -> Calibration:
     """The calibration with mean and covariance of all draws of a posterior, for linear propagation, star by star."""
-    draws = _draws_of(calibration, path)
-    return dataclasses.replace(calibration, values=draws.mean(axis=0), covariance=np.cov(draws, rowvar=False))
+    draws, values = _draws_of(calibration, path), calibration.values.copy()
+    values[calibration.fitted] = draws.mean(axis=0)
+    covariance = calibration.widened(np.cov(draws, rowvar=False))
+    return dataclasses.replace(calibration, values=values, covariance=covariance)
 
 
-def _draws_of(calibration: Calibration, path: Any) -> Float[np.ndarray, "d n"]:
+def digest_of(calibration: Calibration) -> str:
+    """The `digest_of_fit` of the fit of a calibration."""
+    fitted, names = calibration.fitted, calibration.model.names
+    return digest_of_fit(calibration.inputs, [names[i] for i in fitted], calibration.values[fitted])
+
+
+def _draws_of(calibration: Calibration, path: Any) -> Float[np.ndarray, "d f"]:
+    """Draws of the parameters of the fit."""
     names = calibration.model.names
-    return read_draws(path, names, digest_of_fit(calibration.inputs, names, calibration.values))
+    return read_draws(path, tuple(names[i] for i in calibration.fitted), digest_of(calibration))

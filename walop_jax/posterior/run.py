@@ -26,8 +26,8 @@ from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
+from walop_jax.model.specification import Model, Vector, model_without
 from walop_jax.posterior.draws import A_MEAN, read_groups
 
 SAME_FIT = 0.05  # standard errors
@@ -132,8 +132,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         calibration, calset = self.rebuilt, self.calset
         text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
+        if Deviations.name in model.effect_names:
+            model = model_without(model, Deviations.name)
         advice = "run walop-jax refit with this model and version first"
-        if model.names != calibration.model.names:
+        fitted, names = calibration.fitted, calibration.model.names
+        if model.names != tuple(names[i] for i in fitted):
             raise fail("was fitted with another model", file=self.folder, advice=advice)
         likelihood = Likelihood.of(calset, model)
         if likelihood.layout.large:
@@ -145,8 +148,9 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             )
             path = calibration.inputs[0].path
             raise fail(f"{what} calibration.fits holds its covariance", file=path, advice=advice)
-        result = fit(likelihood, start=calibration.values)
-        away = np.abs(result.values - calibration.values) / np.where(result.sigma > 0, result.sigma, 1.0)
+        values = calibration.values[fitted]
+        result = fit(likelihood, start=values)
+        away = np.abs(result.values - values) / np.where(result.sigma > 0, result.sigma, 1.0)
         if not result.converged or np.max(away) > SAME_FIT:
             what = f"{model.names[int(np.argmax(away))]} moves by {np.max(away):.2g} standard errors"
             raise fail(f"fitted again, {what}", file=self.folder, advice=advice)
@@ -154,7 +158,10 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             result = with_honest_errors(result)
         verdict = calibration.verdict
         if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
-            errors = {"covariance": calibration.covariance, "errors_from": verdict.errors_from}
+            errors = {
+                "covariance": calibration.covariance[np.ix_(fitted, fitted)],
+                "errors_from": verdict.errors_from,
+            }
             result = dataclasses.replace(result, **errors)
         return dataclasses.replace(result, verdict=verdict)
 

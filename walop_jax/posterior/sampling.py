@@ -194,7 +194,7 @@ def sample(
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.
     """
-    if result.averaged is not None:
+    if result.mean_of_models:
         raise fail(A_MEAN, file="the fit", advice="fit one, refit(calset, result.model), and sample that")
     options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)

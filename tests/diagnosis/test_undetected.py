@@ -1,0 +1,123 @@
+"""Changes that the data would not show: their second moment by quadrature, and their errors in a product."""
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+from small_run import SMALL
+
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.matrix import first_setting, planned_matrices
+from walop_jax.diagnosis.class_product import Classes, averaged
+from walop_jax.diagnosis.discrepancy import _Block, _carrying, _second_moments, ambiguities
+from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Described
+from walop_jax.model.planning import plan_for_settings
+from walop_jax.model.specification import effect_context
+from walop_jax.posterior import draws
+from walop_jax.simulation.simulate import simulate
+
+AHEAD, SIZE = "retardance v ahead of polariser", 4e-4
+"""Turns q and u of all light from the sky, which standards of 3 % with errors of 2·10⁻⁴ hardly show."""
+
+
+def fitted(seed: int, *texts: str):
+    """A fit of the base model, what may be undetected, and the truth of the set."""
+    effects = [Described.saying(list(texts), [SIZE] * len(texts))] if texts else []
+    simulation = simulate(SMALL, seed=seed, effects=effects)
+    result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
+    context = effect_context(result.model.template, result.calset.exposures)
+    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), context, set(), [])
+    assert not classes.several
+    return result, classes.undetected, simulation
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return fitted(3)
+
+
+def product_of(result, shape) -> Calibration:
+    context = effect_context(result.model.template, result.calset.exposures)
+    return averaged(Calibration.from_fit(result.judged()), Classes(undetected=shape), context)
+
+
+def test_second_moments_are_those_of_the_mixture():
+    """By quadrature of prior × likelihood: one of two amplitudes is there, at one of four widths, or none is."""
+    gram, score, widths = (
+        np.array([[4e4, 0.0], [0.0, 9e2]]),
+        np.array([500.0, -20.0]),
+        np.array([0.02, 0.003]),
+    )
+    block = _Block((), widths, ((0,), (1,)), gram, score, np.zeros((0, 2)))
+    (moments,) = _second_moments([block], 1.0)
+    evidence, squares = [], []
+    for i in range(2):
+        for scale in (1.0, 0.3, 0.1, 0.03):
+            c = np.linspace(-12.0, 12.0, 200_001) * scale * widths[i]
+            # The residuals r change by K c: −½ |r + K c|² without r².
+            density = stats.norm.pdf(c, scale=scale * widths[i])
+            density *= np.exp(-0.5 * gram[i, i] * c**2 - score[i] * c)
+            evidence.append(integrate.trapezoid(density, c))
+            squares.append(integrate.trapezoid(c**2 * density, c))
+    whole = 0.5 + 0.5 * np.mean(evidence)
+    expected = [0.5 * sum(squares[:4]) / 8 / whole, 0.5 * sum(squares[4:]) / 8 / whole]
+    np.testing.assert_allclose(np.diag(moments), expected, rtol=1e-6)
+    assert moments[0, 1] == 0.0
+
+
+def test_few_columns_carry_a_covariance():
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((60, 20))
+    factor = columns[:, [2, 5, 11]] @ rng.standard_normal((3, 9))
+    chosen, loadings = _carrying(columns, factor)
+    carried = columns[:, chosen] @ loadings
+    assert np.linalg.norm(carried @ carried.T - factor @ factor.T) < 3e-3 * np.linalg.norm(factor @ factor.T)
+
+
+def test_values_stay_and_offsets_keep_their_errors(sound):
+    """Of a sound set: diattenuation shows in every exposure, polarisation ahead of the polariser hardly does."""
+    result, shape, _ = sound
+    alone, product = Calibration.from_fit(result.judged()), product_of(result, shape)
+    x, y = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 30))
+    (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
+    np.testing.assert_allclose(m, one, rtol=0, atol=1e-13)
+    errors, stated = (np.sqrt(np.diagonal(a, axis1=1, axis2=2)) for a in (c, within))
+    assert np.all(errors >= stated * (1 - 1e-9))
+    np.testing.assert_allclose(errors[:, [0, 3]], stated[:, [0, 3]], rtol=0.05)
+    assert np.median(errors[:, 1]) > 5 * np.median(stated[:, 1])
+    assert np.median(errors) < 1e-3
+    assert shape.spread < shape.stated
+
+
+def test_what_is_hidden_lies_within_the_errors():
+    """Seen by standards alone, below their errors: elements off by many errors of the fit, the truth within ours."""
+    result, shape, simulation = fitted(5, AHEAD)
+    points, calset = result.calset.points, result.calset
+    setting = first_setting(calset, simulation.truth)
+    plan = plan_for_settings(simulation.truth, setting, calset.filters)
+    true = planned_matrices(simulation.truth, plan, points.x, points.y).reshape(len(points.x), 6)
+    worst = []
+    for product in (Calibration.from_fit(result.judged()), product_of(result, shape)):
+        m, c = product.matrix(points.x, points.y, setting)
+        pulls = np.abs(m - true) / np.sqrt(np.diagonal(c, axis1=1, axis2=2))
+        worst.append(np.median(pulls, axis=0).max())
+    assert worst[0] > 4.0
+    assert worst[1] < 2.0
+
+
+def test_draws_of_a_posterior_keep_what_is_undetected(sound, monkeypatch):
+    """Normal draws of the parameters of the fit stand for a posterior."""
+    result, shape, _ = sound
+    product = product_of(result, shape)
+    assert [product.model.names[i] for i in product.fitted] == list(result.model.names)
+    drawn = np.random.default_rng(2).multivariate_normal(result.values, result.covariance, 4000)
+    monkeypatch.setattr(draws, "read_draws", lambda path, names, digest: drawn)
+    moments = draws.with_moments(product, "posterior.nc")
+    sigma = np.sqrt(np.diag(product.covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(moments.covariance)), sigma, rtol=0.06, atol=1e-7)
+    whole = draws.with_draws(product, "posterior.nc", 4000).draws
+    np.testing.assert_allclose(whole.std(axis=0), sigma, rtol=0.06, atol=1e-7)

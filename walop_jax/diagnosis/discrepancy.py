@@ -1,0 +1,346 @@
+"""Model discrepancy in the product of a diagnosis: what descriptions leave open, and what the data would not show.
+
+Shape        A description without a name is the simplest one that explains the data: a polynomial over the field, one
+             law over the exposures, one kind of polarisation. Its cause has no reason to be so simple. Deviations from
+             it are a Gaussian process, marginalised by one linear step,
+                 δ(x, t) = Σ_j c_j f_j(x, t),   c_j ~ N(0, s²/(n ⟨f_j²⟩))
+             f_j products of a pattern over the field (all polynomials to the third degree), a law over the exposures
+             (none, those of the descriptions, other slow ones) for each kind of polarisation (`GENERATORS`; of cameras
+             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
+             laws: every kind may be as large as what was described, in any shape. In a product, stars have those
+             without a dependence and with those described; others change the parameters alone.
+Undetected   Elements that the model does not let vary have errors of 10⁻⁶, which no experiment has. One further change
+             of polarisation δ may be there: at a place of the train, a diattenuation, retardance or depolarisation,
+             over the field of one degree d ≤ 3, with the prior widths of its kind at all `score.SCALES`. With P₀ = ½
+             beforehand it is absent, every group g of place, phenomenon and degree is as probable as any other. By the
+             evidence B of one linear step,
+                 E[δδᵀ] = Σ_g w_g (C_g + c_g c_gᵀ),   w_g = (1 − P₀) B_g / n / (P₀ + (1 − P₀) Σ B_g / n)
+             is added to the covariance; values stay those of the fit. What data limit adds nothing, what they leave
+             open adds its prior, what they suggest without an alarm adds its size.
+Starlight    Any such change acts on a star, to first order, as one ahead of the train does: few of these, chosen one
+             after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
+Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
+             models that were not chosen, Draper 1995, J. R. Stat. Soc. B 57, 45
+Limits       First order; in the usual setting of the plates. Undetected changes of detectors, in single exposures and
+             of finer structure are not in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special
+
+from walop_jax.calibration.matrix import of_matrix
+from walop_jax.diagnosis.class_members import Laid, Step, classes_of
+from walop_jax.diagnosis.class_product import Classes, Likeness, Shape, Sum
+from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
+from walop_jax.diagnosis.score import SCALES, Matrix, Vector
+from walop_jax.fit.refit import FitResult
+from walop_jax.likelihood.columns import Columns
+from walop_jax.model.effects import Context, Described, FreeForm
+from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
+from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.deviations import CUBIC
+from walop_jax.model.effects.optics import GENERATORS, generators_of
+from walop_jax.model.light import mean_wavelengths
+
+COMPLETE = 0.5  # probability beforehand that a model lacks nothing
+LEFT_OUT = 1e-3  # share of the undetected variance of the matrix that a product may lack
+DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in names) for names in CUBIC)
+
+
+def ambiguities(
+    state: Examination,
+    context: Context,
+    names: Collection[str],
+    groups: Sequence[str],
+    alike: Collection[str] = (),
+) -> Classes:
+    """Classes of the effects of a model that have some names, shapes of its descriptions, and undetected changes.
+
+    `groups` are the names of the added groups of sentences, `alike` those of `class_members.Laid`.
+    """
+    if not state.result.model.template.cameras.pairs:
+        return Classes()
+    laid = Laid(state, alike)
+    return Classes(
+        additions=classes_of(laid, context, names, groups),
+        shape=shape_of(laid) if names else None,
+        undetected=undetected(laid),
+    )
+
+
+def _slopes(laid: Laid, sums: Sequence[Sum], values: Matrix) -> Float[np.ndarray, "p m a"]:
+    """Slopes of the elements of the matrix in amplitudes, which change the free parameters by `values` as well."""
+    vectors, added = laid.added(sums)
+    direct = of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), laid.template.cameras.pairs)
+    return np.moveaxis(direct, 1, -1).reshape(*laid.matrix.shape, -1) + laid.slopes @ values
+
+
+# ------------------------------------------------------------------------------ deviations from a description
+
+
+def shape_of(laid: Laid) -> Shape | None:
+    """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
+    if FreeForm.name in laid.fit.model.effect_names:  # it has every shape
+        return None
+    changes, widths, laws = shape_changes(laid.fit, laid.columns)
+    if not changes:
+        return None
+    sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
+    step = Step(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    column = laid.design.stacked([laid.columns.of(sums)])
+    likeness = step.member("", sums, column, widths, 0.0)
+    slopes = _slopes(laid, sums, likeness.slopes)
+    between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
+    between += likeness.change[:, :, None] * likeness.change[:, None, :]
+    # At another temperature stars have terms that are zero in the usual setting.
+    steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
+    _, at_any = laid.added([((1.0, change),) for change in steady])
+    acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
+    # Of other dependences than those described stars have none: each is a program's worth of derivatives.
+    on_stars = tuple(j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws)
+    return Shape(likeness, on_stars, laid.error_of_p(between), laid.stated)
+
+
+_OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
+
+
+class _Place(NamedTuple):
+    """Changes of one kind of quantity at one place."""
+
+    kinds: tuple[str, ...]
+    where: str
+    place: str
+    origin: str
+
+
+def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vector, set[tuple[str, ...]]]:
+    """Deviations from the shapes of the descriptions in a model, their prior widths, and the laws described."""
+    instrument = fit.model.instrument(fit.values)
+    if not any(isinstance(effect, Described) for effect in instrument.effects):
+        return [], np.zeros(0), set()
+    described = instrument.effect(Described.name)
+    assert isinstance(described, Described)
+    data, squares = _AtData.of(columns), dict[_Place, float]()
+    laws: dict[_Place, dict[tuple[str, ...], None]] = {}
+    for change, amplitude in described.terms():
+        optical = change.kind.partition(" ")[0] in _OPTICS
+        place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
+        parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
+        for _, coefficient, factors in parts:
+            size = float(amplitude) * coefficient * data.rms(change.times(*factors))
+            squares[place] = squares.get(place, 0.0) + size**2
+        laws.setdefault(place, {(): None}).setdefault(change.beside_field)
+    listed = set(described.sentences)
+    changes, widths = list[Sentence](), list[float]()
+    for place, square in squares.items():
+        shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
+        count = len(shapes) / len(place.kinds)
+        for change in shapes:
+            rms = data.rms(change)
+            if change.text not in listed and square * rms > 0.0:
+                changes.append(change)
+                widths.append(np.sqrt(square / max(count, 1.0)) / rms)
+    return changes, np.array(widths), set().union(*laws.values())
+
+
+def _shapes(
+    place: _Place, laws: Sequence[tuple[str, ...]], fit: FitResult, columns: Columns
+) -> Iterator[Sentence]:
+    """All changes of a place with some laws, and other slow ones, that the model can include.
+
+    Steady gains are those of the throughput; other steady numbers have the first four patterns.
+    """
+    exposures, template = fit.calset.exposures, fit.model.template
+    over_field = len(fit.calset.points) >= FEWEST_POINTS
+    dependences = Dependences(exposures, over_field, (), np.ones(len(exposures), bool))
+    slow = [law for form in (*SLOW, *SINGLE) for law in dependences.of(form)] if len(laws) > 1 else []
+    for law in dict.fromkeys((*laws, *slow)):
+        patterns = CUBIC if law or place.kinds == GENERATORS else CUBIC[:4]
+        for pattern, kind in itertools.product(patterns if over_field else CUBIC[:1], place.kinds):
+            change = Sentence(kind, place.where, place.place, (*pattern, *law), place.origin)
+            try:
+                change.check_factors(template)
+            except ValueError:
+                continue
+            if columns.has(((1.0, change),)) and (law or kind != "gain"):
+                yield change
+
+
+@dataclasses.dataclass(frozen=True)
+class _AtData(InExposures):
+    """The (point, exposure) of a set; `wavelength` (µm) is the mean of the band of each exposure."""
+
+    wavelength: Any = 0.0
+    used: Any = None
+
+    @classmethod
+    def of(cls, columns: Columns) -> Self:
+        """Those of a likelihood."""
+        points, plan = columns.likelihood.calset.points, columns.plan
+        of_bands = np.asarray(mean_wavelengths(columns.patched, plan))
+        wavelength = of_bands[np.asarray(plan.band_of)[:, 0]]
+        return cls(
+            columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
+        )
+
+    def rms(self, change: Sentence) -> float:
+        """Root mean square of the factors of a change."""
+        sizes = np.nan_to_num(np.asarray(change.factor(self), float))
+        return float(np.sqrt(np.mean(np.broadcast_to(sizes, self.used.shape)[self.used] ** 2)))
+
+
+# ------------------------------------------------------------------------------------------ undetected changes
+
+
+class _Block(NamedTuple):
+    """Undetected changes at one place: amplitudes, their responses, and the groups that are hypotheses by themselves.
+
+    `along` and `slopes` are the projection on the free parameters and their change, by each amplitude.
+    """
+
+    sums: tuple[Sum, ...]
+    widths: Vector
+    groups: tuple[tuple[int, ...], ...]
+    gram: Matrix
+    scores: Vector
+    slopes: Matrix
+
+
+def undetected(laid: Laid) -> Shape | None:
+    """Covariance of a change that the data would not show, in terms of changes ahead of the train; None of none."""
+    if not (places := _steady_places(laid)):
+        return None
+    step = Step(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    data, front = _AtData.of(laid.columns), places[0]
+    blocks = {place: block for place in places if (block := _block(laid, step, data, *place)) is not None}
+    tried = [block for place, block in blocks.items() if place != front or _is_seen(block)]
+    if not tried or front not in blocks:
+        return None
+    moments = _second_moments(tried, laid.state.floor)
+    factors = [  # of the covariance of the matrix, its columns in units of the standard errors
+        _slopes(laid, block.sums, block.slopes) @ _root(moment)
+        for block, moment in zip(tried, moments, strict=True)
+    ]
+    errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
+    factor = (np.concatenate(factors, axis=-1) / errors).reshape(laid.errors.size, -1)
+    ahead = blocks[front]
+    slopes = _slopes(laid, ahead.sums, ahead.slopes)
+    chosen, loadings = _carrying((slopes / errors).reshape(laid.errors.size, -1), factor)
+    if not chosen:
+        return None
+    covariance, count = loadings @ loadings.T, len(laid.fit.model.free)
+    between = slopes[..., chosen] @ covariance @ np.swapaxes(slopes[..., chosen], 1, 2)
+    likeness = Likeness(
+        name="",
+        evidence=0.0,
+        sums=tuple(ahead.sums[j] for j in chosen),
+        amplitudes=np.zeros(len(chosen)),
+        covariance=covariance,
+        values=np.zeros(count),
+        slopes=ahead.slopes[:, chosen],
+        change=np.zeros_like(laid.matrix),
+    )
+    return Shape(likeness, tuple(range(len(chosen))), laid.error_of_p(between), laid.stated)
+
+
+def _steady_places(laid: Laid) -> list[tuple[str, str]]:
+    """Places of the train, that ahead of it first, whether or not exposures show it."""
+    bare = dataclasses.replace(laid.template, effects=())
+    places = list(itertools.chain(*places_of(bare, laid.fit.calset.exposures)))
+    front = places[:1] if bare.polariser is None else [("ahead of", bare.polariser.name)]
+    return [*front, *(place for place in places if place not in front)]
+
+
+def _block(laid: Laid, step: Step, data: _AtData, where: str, place: str) -> _Block | None:
+    """The undetected changes of a place; None of a place that has none."""
+    over_field = len(laid.fit.calset.points) >= FEWEST_POINTS
+    changes, degrees = list[Sentence](), list[tuple[str, int]]()
+    for (pattern, degree), kind in itertools.product(zip(CUBIC, DEGREES, strict=True), GENERATORS):
+        change = Sentence(kind, where, place, pattern)
+        if (over_field or not degree) and laid.columns.has(((1.0, change),)):
+            changes.append(change)
+            degrees.append((kind.partition(" ")[0], degree))
+    if not changes:
+        return None
+    groups = {key: tuple(i for i, of in enumerate(degrees) if of == key) for key in dict.fromkeys(degrees)}
+    patterns = {key: len({changes[i].factors for i in group}) for key, group in groups.items()}
+    widths = np.array(
+        [
+            AMPLITUDES[change.parameter].width / (np.sqrt(patterns[key]) * data.rms(change))
+            for change, key in zip(changes, degrees, strict=True)
+        ]
+    )
+    sums = tuple(((1.0, change),) for change in changes)
+    column = laid.design.stacked([laid.columns.of(sums)])
+    along = step.projector.basis.T @ column
+    projected = column - step.projector.basis @ along
+    return _Block(
+        sums, widths, tuple(groups.values()), projected.T @ projected, projected.T @ step.left,
+        -step.projector.taken_up(along),
+    )  # fmt: skip
+
+
+def _is_seen(block: _Block) -> bool:
+    """True if anything of a place is in the data."""
+    return bool(np.any(np.diag(block.gram) > 0.0))
+
+
+def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
+    """E[c cᵀ] of the amplitudes of every block, where at most one group is not zero; evidence in units of `floor`."""
+    evidence, moments = [], []
+    for block in blocks:
+        for group in map(list, block.groups):
+            widths = block.widths[group]
+            value, vector = np.linalg.eigh(block.gram[np.ix_(group, group)] * np.outer(widths, widths))
+            value, along = np.clip(value, 0.0, None), vector.T @ (block.scores[group] * widths)
+            vector = widths[:, None] * vector
+            for square in SCALES**2:
+                shrunk = square / (1.0 + square * value)
+                evidence.append(0.5 * np.sum(shrunk * along**2 - np.log1p(square * value)) / floor**2)
+                mean = vector @ (shrunk * along)
+                moments.append((vector * shrunk) @ vector.T + np.outer(mean, mean))
+    absent = np.log(COMPLETE) - np.log((1.0 - COMPLETE) / len(evidence))
+    weights = special.softmax([*evidence, absent])[:-1]
+    weighted, totals = (weight * moment for weight, moment in zip(weights, moments, strict=True)), []
+    for block in blocks:
+        total = np.zeros_like(block.gram)
+        for group in block.groups:
+            total[np.ix_(group, group)] = sum(itertools.islice(weighted, len(SCALES)))
+        totals.append(total)
+    return totals
+
+
+def _root(covariance: Matrix) -> Matrix:
+    """A factor F of a covariance F Fᵀ."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.clip(value, 0.0, None))
+
+
+def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:
+    """Few `columns`, and loadings L, with columns[:, chosen] L Lᵀ columns[:, chosen]ᵀ close to factor factorᵀ.
+
+    One after the other the column that explains most of the rest, until less than `LEFT_OUT` is left.
+    """
+    remaining, rest, chosen = columns.copy(), factor.copy(), list[int]()
+    length, total = np.linalg.norm(columns, axis=0), float(np.sum(factor**2))
+    while len(chosen) < columns.shape[1] and np.sum(rest**2) > LEFT_OUT * total:
+        norm = np.linalg.norm(remaining, axis=0)
+        unit = remaining / np.where(norm > 1e-6 * length, norm, np.inf)
+        explained = np.sum((unit.T @ rest) ** 2, axis=1)
+        best = int(np.argmax(explained))
+        if explained[best] <= 0.0:
+            break
+        chosen.append(best)
+        direction = unit[:, best, None]
+        remaining -= direction @ (direction.T @ remaining)
+        rest -= direction @ (direction.T @ rest)
+    return chosen, np.linalg.lstsq(columns[:, chosen], factor, rcond=None)[0]
