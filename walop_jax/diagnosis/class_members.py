@@ -133,7 +133,7 @@ class Laid:
 
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
-        step = Step(self, at, lost)
+        step = LinearStep(self, at, lost)
         addition = step.addition(name, sums)
         # The addition is among the candidates: it is no further member.
         rivals = (
@@ -181,7 +181,7 @@ class Laid:
         return float(np.median(errors)) if errors.size else 0.0
 
 
-class Step:
+class LinearStep:
     """One linear step from the fit to a model without some amplitudes and with others."""
 
     def __init__(self, laid: Laid, at: Int[np.ndarray, " a"], lost: Vector) -> None:

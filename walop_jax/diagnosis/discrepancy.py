@@ -37,7 +37,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import of_matrix
-from walop_jax.diagnosis.class_members import Laid, Step, classes_of
+from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, Likeness, Shape, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
@@ -95,7 +95,7 @@ def shape_of(laid: Laid) -> Shape | None:
     if not changes:
         return None
     sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
-    step = Step(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
     column = laid.design.stacked([laid.columns.of(sums)])
     likeness = step.member("", sums, column, widths, 0.0)
     slopes = _slopes(laid, sums, likeness.slopes)
@@ -219,7 +219,7 @@ def undetected(laid: Laid) -> Shape | None:
     """Covariance of a change that the data would not show, in terms of changes ahead of the train; None of none."""
     if not (places := _steady_places(laid)):
         return None
-    step = Step(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
     data, front = _AtData.of(laid.columns), places[0]
     blocks = {place: block for place in places if (block := _block(laid, step, data, *place)) is not None}
     tried = [block for place, block in blocks.items() if place != front or _is_seen(block)]
@@ -260,7 +260,7 @@ def _steady_places(laid: Laid) -> list[tuple[str, str]]:
     return [*front, *(place for place in places if place not in front)]
 
 
-def _block(laid: Laid, step: Step, data: _AtData, where: str, place: str) -> _Block | None:
+def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
     """The undetected changes of a place; None of a place that has none."""
     over_field = len(laid.fit.calset.points) >= FEWEST_POINTS
     changes, degrees = list[Sentence](), list[tuple[str, int]]()
