@@ -57,7 +57,7 @@ Change = Sequence[tuple[float, Sentence]]
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 CAMERAS = ("counts", "opposite", *ADDED)
 """Stages of slots in some cameras: counts ahead of the detectors, of the opposite point, what detectors add to them."""
-GAPS_TOGETHER = 32  # thicknesses of air whose fringes are computed together, in one program for any number
+GAPS_TOGETHER = 10  # thicknesses of air whose fringes are computed together, in one program for any number
 
 
 def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
@@ -207,6 +207,7 @@ class Columns:
         self._known: dict[Sentence, list[SlotTerm]] = {}
         self.reader = PointReader(likelihood.calset, self.plan, likelihood.model.template, mirrored=True)
         self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
+        self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 
     def has(self, change: Change) -> bool:
         """True if a change is a sum of slots to first order."""
@@ -250,7 +251,7 @@ class Columns:
         distinct = list(dict.fromkeys(gaps))
         if not distinct:
             return {}
-        padded = np.pad(np.array(distinct), (0, -len(distinct) % (8 * GAPS_TOGETHER)), mode="edge")
+        padded = np.pad(np.array(distinct), (0, -len(distinct) % 256), mode="edge")
         visibility = np.asarray(_visible(self.instrument, self.fringe_plan, padded))
         return {gap: bool(value > LEAST_SURVIVING) for gap, value in zip(distinct, visibility, strict=False)}
 
@@ -289,6 +290,21 @@ class Columns:
             self._responses[start] = response
         return response
 
+    def fringes(
+        self, start: int, gaps: tuple[float, ...], x: Vector, y: Vector, sites: int
+    ) -> Float[np.ndarray, "p m w g b k 4"]:
+        """Slopes in the fringes of `gaps` (µm) at every place of `fringed`, for the points of `responses`."""
+        if (start, gaps) in self._fringes:
+            return self._fringes[start, gaps]
+        at = [np.stack([c, -c], 1)[:, :sites] for c in (x, y)]
+        padded = np.pad(np.array(gaps), (0, -len(gaps) % GAPS_TOGETHER), mode="edge")
+        batches = padded.reshape(-1, GAPS_TOGETHER)
+        slopes = [_fringes_at(self.instrument, self.fringe_plan, batch, *at) for batch in batches]
+        joined = np.concatenate(slopes, axis=3)[:, :, :, : len(gaps)]
+        if len(self.likelihood.used) <= limits.RESPONSES_KEPT:
+            self._fringes[start, gaps] = joined
+        return joined
+
     def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
         return self.rounded(changes, len(changes))[0]
@@ -323,7 +339,7 @@ class ResponseBlock:
     """
 
     def __init__(self, of: Columns, start: int, every: Sequence[Slot]) -> None:
-        self.of = of
+        self.of, self.start = of, start
         data, self.found = of.responses(start)
         arrays = (data.x, data.y, data.weight, data.band, data.source)
         self.x, self.y, weight, self.band, source = map(np.asarray, arrays)
@@ -381,10 +397,7 @@ class ResponseBlock:
         distinct = list(dict.fromkeys(gaps))
         if not distinct:
             return {}
-        sites = [np.stack([c, -c], 1)[:, : self.sites] for c in (self.x, self.y)]
-        padded = np.pad(np.array(distinct), (0, -len(distinct) % GAPS_TOGETHER), mode="edge")
-        at, batches = (self.of.instrument, self.of.fringe_plan), padded.reshape(-1, GAPS_TOGETHER)
-        joined = np.concatenate([_fringes_at(*at, batch, *sites) for batch in batches], axis=3)
+        joined = self.of.fringes(self.start, tuple(distinct), self.x, self.y, self.sites)
         return {
             ("fringes", place, gap): joined[:, :, plate, i]
             for i, gap in enumerate(distinct)
