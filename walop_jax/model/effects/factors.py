@@ -56,69 +56,66 @@ class Factor:
 # ------------------------------------------------------------------------------- with numbers or names in them
 
 
-def _ring(degree: str) -> Factor:
+def _ring(at: Any, units: Units, degree: str) -> Any:
     """Legendre polynomial of some degree in (X² + Y²)/h² − 1, h the scale of the field."""
-
-    def value(at: Any, units: Units) -> Any:
-        square = (at.x**2 + at.y**2) / units.field**2
-        return legendre.polynomial(int(degree), 2.0 * square / LARGEST_SQUARE - 1.0)
-
-    words = f"in rings over the field (Legendre polynomial {degree} of the radius squared)"
-    return Factor(f"ring {degree}", FIELD, words, MORE_POINTS, value, "ring", (degree,))
+    square = (at.x**2 + at.y**2) / units.field**2
+    return legendre.polynomial(int(degree), 2.0 * square / LARGEST_SQUARE - 1.0)
 
 
-def _harmonic(wave: str, order: str, prefix: str) -> Factor:
+def _wave(at: Any, _: Units, wave: str, order: str, prefix: str) -> Any:
     """Cosine or sine of a multiple of the angle of a moving element, by the prefix of its columns."""
-
-    def value(at: Any, _: Units) -> Any:
-        angle = at.angle(prefix)
-        return getattr(np if isinstance(angle, np.ndarray) else jnp, wave)(int(order) * angle)
-
-    words = f"as the {'cosine' if wave == 'cos' else 'sine'} of {order} × the angle of {prefix}"
-    test = "a full turn at more angles in random order, then with the element mounted turned by 90°"
-    return Factor(f"{wave} {order} {prefix}", EXPOSURE, words, test, value, wave, (order, prefix))
+    angle = at.angle(prefix)
+    return getattr(np if isinstance(angle, np.ndarray) else jnp, wave)(int(order) * angle)
 
 
-def _span(start: str, stop: str) -> Factor:
-    """1 from one time to another (hours since the first exposure), 0 elsewhere."""
-    return Factor(
-        f"hours {start} to {stop}", EXPOSURE, f"from {start} to {stop} h after the first exposure", ONCE_MORE,
-        lambda at, _: ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0, "hours", (start, stop),
-    )  # fmt: skip
-
-
-def _exposure(number: str) -> Factor:
-    """1 in one exposure of the list, counted from 0; 0 in all others."""
-    return Factor(
-        f"exposure {number}", EXPOSURE, f"in exposure {number} of the list (the first is 0)", ONCE_MORE,
-        lambda at, _: (at.number == int(number)) * 1.0, "exposure", (number,),
-    )  # fmt: skip
-
-
-def _kind(name: str) -> Factor:
-    """1 in exposures of a KIND, 0 in all others."""
-    return Factor(
-        f"kind {name}", EXPOSURE, f"in exposures of KIND {name}", "the same field points in exposures of another KIND",
-        lambda at, _: at.of_kind(name) * 1.0, "kind", (name,),
-    )  # fmt: skip
-
-
-def _side(prefix: str) -> Factor:
+def _side(at: Any, _: Units, prefix: str) -> Any:
     """1 where a moving element came from smaller angles, −1 where from larger ones, 0 where it did not move."""
+    angle = at.angle(prefix)
+    xp: Any = np if isinstance(angle, np.ndarray) else jnp
+    hours = xp.broadcast_to(at.hours, angle.shape)
+    order = xp.argsort(hours, axis=-1)
+    turned = xp.diff(xp.take_along_axis(angle, order, axis=-1), axis=-1)
+    side = xp.sign(xp.sin(xp.where(xp.abs(turned) > 1e-9, turned, 0.0)))
+    first = xp.zeros_like(angle[..., :1])
+    return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
 
-    def value(at: Any, _: Units) -> Any:
-        angle = at.angle(prefix)
-        xp: Any = np if isinstance(angle, np.ndarray) else jnp
-        hours = xp.broadcast_to(at.hours, angle.shape)
-        order = xp.argsort(hours, axis=-1)
-        turned = xp.diff(xp.take_along_axis(angle, order, axis=-1), axis=-1)
-        side = xp.sign(xp.sin(xp.where(xp.abs(turned) > 1e-9, turned, 0.0)))
-        first = xp.zeros_like(angle[..., :1])
-        return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
 
-    words = f"with the side from which {prefix} came (1: from smaller angles)"
-    test = "each angle once more, reached from the other side"
-    return Factor(f"side {prefix}", EXPOSURE, words, test, value, "side", (prefix,))
+FORMS: Mapping[str, tuple[str, str, str, str, Callable[..., Any]]] = {
+    "ring N": (
+        r"ring (\d+)", FIELD, "in rings over the field (Legendre polynomial {0} of the radius squared)", MORE_POINTS,
+        _ring,
+    ),
+    "cos N PREFIX, sin N PREFIX": (
+        r"(cos|sin) (\d+) (\S+)", EXPOSURE, "as the {0} of {1} × the angle of {2}",
+        "a full turn at more angles in random order, then with the element mounted turned by 90°", _wave,
+    ),
+    "hours A to B": (
+        rf"hours {NUMBER} to {NUMBER}", EXPOSURE, "from {0} to {1} h after the first exposure", ONCE_MORE,
+        lambda at, _, start, stop: ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0,
+    ),
+    "exposure N": (
+        r"exposure (\d+)", EXPOSURE, "in exposure {0} of the list (the first is 0)", ONCE_MORE,
+        lambda at, _, number: (at.number == int(number)) * 1.0,
+    ),
+    "kind KIND": (
+        r"kind (\S+)", EXPOSURE, "in exposures of KIND {0}", "the same field points in exposures of another KIND",
+        lambda at, _, name: at.of_kind(name) * 1.0,
+    ),
+    "side PREFIX": (
+        r"side (\S+)", EXPOSURE, "with the side from which {0} came (1: from smaller angles)",
+        "each angle once more, reached from the other side", _side,
+    ),
+    # The fringes depend on the thickness of their air themselves.
+    "gap N": (
+        rf"gap (?!-){NUMBER}", SHAPE, "of {0} µm of air (amplitude at a maximum)", "", lambda at, _, thickness: 1.0
+    ),
+}  # fmt: skip
+"""Factors with numbers or names, by their form in messages: pattern of the text, then all of a `Factor` but the text,
+its words and its value as functions of these."""
+_SPELT = {"cos": "cosine", "sin": "sine"}
+
+
+# ------------------------------------------------------------------------------------------------------ plain ones
 
 
 def _since_evening(at: Any, _: Units) -> Any:
@@ -129,27 +126,6 @@ def _since_evening(at: Any, _: Units) -> Any:
     first = xp.diff(hours, axis=-1, prepend=hours[..., :1] - 2.0 * GAP) > GAP
     since = hours - xp.maximum.accumulate(xp.where(first, hours, -xp.inf), axis=-1)
     return xp.take_along_axis(since, xp.argsort(order, axis=-1), axis=-1)
-
-
-def _gap(thickness: str) -> Factor:
-    """Thickness (µm) of the air of a change by fringes: 1, as the fringes depend on it themselves."""
-    words = f"of {thickness} µm of air (amplitude at a maximum)"
-    return Factor(f"gap {thickness}", SHAPE, words, "", lambda at, _: 1.0, "gap", (thickness,))
-
-
-FORMS: Mapping[str, tuple[str, Callable[..., Factor]]] = {
-    "ring N": (r"ring (\d+)", _ring),
-    "cos N PREFIX, sin N PREFIX": (r"(cos|sin) (\d+) (\S+)", _harmonic),
-    "hours A to B": (rf"hours {NUMBER} to {NUMBER}", _span),
-    "exposure N": (r"exposure (\d+)", _exposure),
-    "kind KIND": (r"kind (\S+)", _kind),
-    "side PREFIX": (r"side (\S+)", _side),
-    "gap N": (rf"gap (?!-){NUMBER}", _gap),
-}
-"""Factors with numbers or names, by their form in messages: pattern of the text, and constructor."""
-
-
-# ------------------------------------------------------------------------------------------------------ plain ones
 
 
 PLAIN: Mapping[str, Factor] = {
@@ -216,7 +192,10 @@ def factor(text: str) -> Factor:
     """The factor of a text. Raises ValueError, with the nearest ones, for an unknown text."""
     if text in PLAIN:
         return PLAIN[text]
-    for pattern, make in FORMS.values():
+    for pattern, depends_on, words, test, value in FORMS.values():
         if match := re.fullmatch(pattern, text):
-            return make(*match.groups())
+            given = match.groups()
+            words = words.format(*(_SPELT.get(item, item) for item in given))
+            of_given = functools.partial(lambda value, given, *at: value(*at, *given), value, given)
+            return Factor(text, depends_on, words, test, of_given, text.split()[0], given)
     raise unknown_name("factor", text, (*PLAIN, *FORMS))

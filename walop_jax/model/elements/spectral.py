@@ -69,29 +69,18 @@ def check_curve(name: str, values: Curve | None, knots: Sequence[float]) -> None
 
 def spline(knots: Sequence[float], values: Curve, at: Float[Array, " n"]) -> Float[Array, " n"]:
     """Natural cubic spline through `values` at `knots`, continued as straight lines."""
-    x = np.asarray(knots, float)
-    if len(x) == 1:
+    if len(knots) == 1:
         return jnp.broadcast_to(values[0], jnp.shape(at))
-    h = np.diff(x)
-    bends = jnp.asarray(_bends(x)) @ values  # second derivatives at the knots
-    piece = jnp.clip(jnp.searchsorted(jnp.asarray(x), at) - 1, 0, len(h) - 1)
-    low, step = jnp.asarray(x)[piece], jnp.asarray(h)[piece]
-    inside = jnp.clip(at, x[0], x[-1])
-    b = (inside - low) / step
-    a = 1.0 - b
-    first, second = values[piece], values[piece + 1]
-    curved = ((a**3 - a) * bends[piece] + (b**3 - b) * bends[piece + 1]) * step**2 / 6.0
-    steep = (second - first) / step + (
-        (3.0 * b**2 - 1.0) * bends[piece + 1] - (3.0 * a**2 - 1.0) * bends[piece]
-    ) * step / 6.0
-    return a * first + b * second + curved + steep * (at - inside)
-
-
-def _bends(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """Matrix from values to second derivatives at the knots: de Boor's tridiagonal system."""
     from scipy.interpolate import CubicSpline
 
-    return CubicSpline(x, np.eye(len(x)), bc_type="natural")(x, 2)
+    # Powers of each piece, from third to none, as linear functions of the values.
+    natural = CubicSpline(np.asarray(knots, float), np.eye(len(knots)), bc_type="natural")
+    piece = jnp.clip(jnp.searchsorted(jnp.asarray(natural.x), at) - 1, 0, len(knots) - 2)
+    cubic, square, slope, start = (jnp.asarray(natural.c) @ values)[:, piece]
+    inside = jnp.clip(at, natural.x[0], natural.x[-1])
+    t = inside - jnp.asarray(natural.x)[piece]
+    steep = (3.0 * cubic * t + 2.0 * square) * t + slope
+    return ((cubic * t + square) * t + slope) * t + start + steep * (at - inside)
 
 
 class SpectralElement(WithCurves):
