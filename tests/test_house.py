@@ -40,6 +40,7 @@ ROOMS = (
 )
 OWNERS = {
     "astropy": {"io", "data", "sky", "calibration", "diagnosis", "nights"},
+    "optimistix": {"fit"},
     "emcee": {"posterior"},
     "arviz": {"posterior"},
     "arviz_stats": {"posterior"},
@@ -51,7 +52,7 @@ OWNERS = {
     "tomlkit": {"simulation", "model", "fit"},
 }
 # Imported by nobody: tools of the tests, and what there is no need of.
-STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "optimistix", "pytest", "oracle", "tests"}
+STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
 LONGEST = 600  # a question, not a goal: split by idea, never by length
 QUESTION = re.compile(r"(what|whether|where|how|who|which)\b", re.IGNORECASE)  # no opening of a docstring
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")

@@ -16,7 +16,7 @@ from walop_jax.calibration.matrix import of_structure
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import model_for
-from walop_jax.fit.minimise import Ending
+from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Structure
@@ -256,7 +256,7 @@ def test_models_without_data():
 
 def test_quality_bits_follow_the_fit(result):
     assert result.judged().verdict.quality == 0
-    minimum = dataclasses.replace(result.minimum, result=Ending.STAGNATION, condition=1e11)
+    minimum = dataclasses.replace(result.minimum, result=RESULTS.stagnation, condition=1e11)
     expansion = dataclasses.replace(result.expansion, data=10.0 * result.dof)
     values = result.values.copy()
     index = result.model.index("pupil.magnification")

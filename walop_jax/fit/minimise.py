@@ -18,18 +18,24 @@ Source      `SOURCE`: the method and its trust region.
 from __future__ import annotations
 
 import dataclasses
-import enum
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
 import numpy as np
+import optimistix as optx
 import scipy.linalg
 from jaxtyping import Float
+
+from walop_jax.model.compiled import compiled
 
 SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
+RESULTS = optx.RESULTS
 
 MAXIMUM_STEPS = 200
 """Along a curved valley that only a prior closes (throughput and flux) there may be more than a hundred."""
@@ -42,7 +48,6 @@ LARGEST_CONDITION = 1e14
 # valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved keeps its λ
 # and with it a slow end: directions that the data hardly see then take forty steps.
 BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
-SHRUNK, GROWN = 0.25, 3.5  # factors of the size of the trust region
 
 
 @runtime_checkable
@@ -65,26 +70,17 @@ class Quadratic(Protocol):
         ...
 
 
-class Ending(enum.Enum):
-    """Endings of a search, in words."""
-
-    SUCCESSFUL = "converged: {reached}"
-    ILL_CONDITIONED = "parameters cannot be distinguished: condition number {condition:.1e}"
-    STAGNATION = "no step lowers χ² any more, {reached}"
-    NOT_FINITE = "the model is not finite at the start values"
-    UNFINISHED = "not converged after {steps} steps, {reached}"
-
-
 @dataclasses.dataclass(frozen=True)
 class Minimum:
     """End of a search: `x` in the units it was given, the expansion there and the gates.
 
-    `steps` counts the places looked at, `history` holds their objectives; `message` says `result` with its numbers.
+    `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
+    `optimistix.RESULTS`, and `message` says it in words.
     """
 
     x: Vector
     expansion: Quadratic
-    result: Ending
+    result: optx.RESULTS
     message: str
     steps: int
     scaled_gradient: float
@@ -94,7 +90,7 @@ class Minimum:
     @property
     def converged(self) -> bool:
         """True if the minimum was reached and is well conditioned."""
-        return self.result is Ending.SUCCESSFUL
+        return bool(self.result == RESULTS.successful)
 
 
 def minimise(
@@ -120,12 +116,12 @@ def minimise(
     size = 1.0 / damping if damping > 0 else np.inf
     current, step, history = None, np.zeros(len(x)), []
     distance, before, condition = np.inf, np.inf, np.inf
-    result = Ending.UNFINISHED
+    result = RESULTS.nonlinear_max_steps_reached
     while len(history) < maximum_steps:
         candidate = evaluate(trial)
         history.append(candidate.objective)
         if current is None and not np.isfinite(candidate.objective):
-            current, result = candidate, Ending.NOT_FINITE
+            current, result = candidate, RESULTS.nonfinite
             break
         lowered = current is None or candidate.objective < current.objective
         size, accept = _judged(step, current, candidate, size)
@@ -142,16 +138,23 @@ def minimise(
         if min(distance, remaining) < tolerance or rough or (last and distance**2 < smallest):
             if tolerance <= distance and remaining < tolerance:
                 x, distance = x + step, remaining
-            result = Ending.ILL_CONDITIONED if condition > LARGEST_CONDITION else Ending.SUCCESSFUL
+            result = RESULTS.conlim if condition > LARGEST_CONDITION else RESULTS.successful
             break
         if last:
-            result = Ending.STAGNATION
+            result = RESULTS.stagnation
             break
         trial = x + step
     assert current is not None
     steps, reached = len(history), f"scaled gradient {distance:.1e}"
-    message = result.value.format(reached=reached, condition=condition, steps=steps)
-    return Minimum(x, current, result, message, steps, distance, condition, tuple(history))
+    messages = (
+        (RESULTS.successful, f"converged: {reached}"),
+        (RESULTS.conlim, f"parameters cannot be distinguished: condition number {condition:.1e}"),
+        (RESULTS.stagnation, f"no step lowers χ² any more, {reached}"),
+        (RESULTS.nonfinite, "the model is not finite at the start values"),
+    )
+    unfinished = f"not converged after {steps} steps, {reached}"
+    message = next((text for outcome, text in messages if bool(result == outcome)), unfinished)
+    return Minimum(x, current, result, message, steps, distance, condition, tuple(history))  # pyright: ignore[reportArgumentType]
 
 
 def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:
@@ -196,11 +199,27 @@ def _judged(step: Vector, here: Quadratic | None, there: Quadratic, size: float)
     """Size of the trust region after a step from here to there, and whether it is taken."""
     if here is None:
         return size, True
-    change = (there.objective if np.isfinite(there.objective) else np.inf) - here.objective
-    predicted = _change(step, here)
-    if not change <= BADLY_PREDICTED * predicted:
-        # From no damping at all the first retreat is to λ = 1.
-        size = SHRUNK * size if np.isfinite(size) else 1.0
-    elif change < WELL_PREDICTED * predicted and predicted < 0:
-        size = GROWN * size
-    return size, change <= ROUNDING * abs(here.objective)
+    objective = there.objective if np.isfinite(there.objective) else np.inf
+    slopes = here.gradient @ step, step @ here.matrix @ step
+    grown, predicted = map(np.asarray, _region(size, here.objective, objective, *slopes))
+    # From no damping at all the first retreat is to λ = 1.
+    grown = float(grown) if predicted or np.isfinite(grown) else 1.0
+    return grown, objective - here.objective <= ROUNDING * abs(here.objective)
+
+
+def _of_step(size: Any, here: Any, there: Any, slope: Any, bend: Any) -> Any:
+    """The trust region of optimistix along one step: numbers, so that one program serves any number of parameters.
+
+    Its objective is half of the sum of squares.
+    """
+    operator = lx.MatrixLinearOperator(bend[None, None], lx.positive_semidefinite_tag)
+    along = optx.FunctionInfo.EvalGradHessian(0.5 * here, slope[None], operator)
+    state = eqx.tree_at(lambda s: s.step_size, _REGION.init(jnp.zeros(1), None), size)  # pyright: ignore[reportArgumentType]
+    grown, accept, *_ = _REGION.step(
+        jnp.array(False), jnp.zeros(1), jnp.ones(1), along, optx.FunctionInfo.Eval(0.5 * there), state
+    )
+    return grown, accept
+
+
+_REGION = optx.ClassicalTrustRegion(low_cutoff=BADLY_PREDICTED, high_cutoff=WELL_PREDICTED)
+_region = compiled(_of_step, kept_as="region")

@@ -74,7 +74,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "astropy")
+SOFTWARE = ("walop-jax", "jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy", "scipy", "astropy")
 
 
 def versions_of(names: Iterable[str]) -> dict[str, str]:

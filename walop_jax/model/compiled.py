@@ -48,7 +48,7 @@ from walop_jax.io.code import cores
 FOLDER = "programs"
 CACHE_VARIABLE = "WALOP_JAX_CACHE"
 _DIGEST = hashlib.sha256().digest_size
-_PACKAGES = ("jax", "jaxlib", "equinox", "numpy")
+_PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
 _KNOWN = ("walop_jax", "builtins", "types", "functools", "operator", "_operator", *_PACKAGES)
 _MOST = 500  # programs that are kept, those used last
 _STARTED = time.time()

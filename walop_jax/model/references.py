@@ -75,7 +75,7 @@ def references(model: Model, filters: Iterable[str] = ()) -> tuple[Reference, ..
 # ------------------------------------------------------------------------------------------------- as BibTeX
 
 _YEAR = re.compile(r"^(?P<who>[^\d;]+?),? (?P<year>(?:19|20)\d\d), (?P<rest>.+)$")
-_SOFTWARE = ("jax2018", "equinox2021", "astropy2022")
+_SOFTWARE = ("jax2018", "equinox2021", "optimistix2024", "astropy2022")
 _OF_SAMPLES = ("emcee2013", "arviz2019")
 
 
