@@ -46,7 +46,7 @@ def product_of(result, shape) -> Calibration:
 
 
 def test_second_moments_are_those_of_the_mixture():
-    """By quadrature of prior × likelihood: one of two amplitudes is there, at one of four widths, or none is."""
+    """By quadrature of prior × likelihood: each of two amplitudes is there, at one of four widths, or not."""
     gram, score, widths = (
         np.array([[4e4, 0.0], [0.0, 9e2]]),
         np.array([500.0, -20.0]),
@@ -63,8 +63,8 @@ def test_second_moments_are_those_of_the_mixture():
             density *= np.exp(-0.5 * gram[i, i] * c**2 - score[i] * c)
             evidence.append(integrate.trapezoid(density, c))
             squares.append(integrate.trapezoid(c**2 * density, c))
-    whole = 0.5 + 0.5 * np.mean(evidence)
-    expected = [0.5 * sum(squares[:4]) / 8 / whole, 0.5 * sum(squares[4:]) / 8 / whole]
+    # Each of two is there with a probability of a half, at any of four scales.
+    expected = [sum(squares[i : i + 4]) / 8 / (0.5 + sum(evidence[i : i + 4]) / 8) for i in (0, 4)]
     np.testing.assert_allclose(np.diag(moments), expected, rtol=1e-6)
     assert moments[0, 1] == 0.0
 

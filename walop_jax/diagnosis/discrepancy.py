@@ -9,12 +9,12 @@ Shape        A description without a name is the simplest one that explains the 
              and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
              laws: every kind may be as large as what was described, in any shape. In a product, stars have those
              without a dependence and with those described; others change the parameters alone.
-Undetected   Elements that the model does not let vary have errors of 10⁻⁶, which no experiment has. One further change
-             of polarisation δ may be there: at a place of the train, a diattenuation, retardance or depolarisation,
-             over the field of one degree d ≤ 3, with the prior widths of its kind at all `score.SCALES`. With P₀ = ½
-             beforehand it is absent, every group g of place, phenomenon and degree is as probable as any other. By the
-             evidence B of one linear step,
-                 E[δδᵀ] = Σ_g w_g (C_g + c_g c_gᵀ),   w_g = (1 − P₀) B_g / n / (P₀ + (1 − P₀) Σ B_g / n)
+Undetected   Elements that the model does not let vary have errors of 10⁻⁶, which no experiment has. Further changes of
+             polarisation δ may be there: at a place of the train, a diattenuation, retardance or depolarisation,
+             over the field of one degree d ≤ 3, with the prior widths of its kind at all `score.SCALES`. Each of these
+             n groups g is there or not, with a probability π = 1/n beforehand: one change is expected. By the
+             evidence B_g of one linear step,
+                 E[δδᵀ] = Σ_g p_g (C_g + c_g c_gᵀ),   p_g = π B_g / (1 − π + π B_g)
              is added to the covariance; values stay those of the fit. What data limit adds nothing, what they leave
              open adds its prior, what they suggest without an alarm adds its size.
 Starlight    Any such change acts on a star, to first order, as one ahead of the train does: few of these, chosen one
@@ -51,7 +51,7 @@ from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.light import mean_wavelengths
 
-COMPLETE = 0.5  # probability beforehand that a model lacks nothing
+EXPECTED = 1.0  # number of undetected changes beforehand
 LEFT_OUT = 1e-3  # share of the undetected variance of the matrix that a product may lack
 DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in names) for names in CUBIC)
 
@@ -295,28 +295,27 @@ def _is_seen(block: _Block) -> bool:
 
 
 def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
-    """E[c cᵀ] of the amplitudes of every block, where at most one group is not zero; evidence in units of `floor`."""
-    evidence, moments = [], []
+    """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
+    prior, moments = EXPECTED / sum(len(block.groups) for block in blocks), []
     for block in blocks:
+        moment = np.zeros_like(block.gram)
         for group in map(list, block.groups):
             widths = block.widths[group]
             value, vector = np.linalg.eigh(block.gram[np.ix_(group, group)] * np.outer(widths, widths))
             value, along = np.clip(value, 0.0, None), vector.T @ (block.scores[group] * widths)
-            vector = widths[:, None] * vector
-            for square in SCALES**2:
-                shrunk = square / (1.0 + square * value)
-                evidence.append(0.5 * np.sum(shrunk * along**2 - np.log1p(square * value)) / floor**2)
-                mean = vector @ (shrunk * along)
-                moments.append((vector * shrunk) @ vector.T + np.outer(mean, mean))
-    absent = np.log(COMPLETE) - np.log((1.0 - COMPLETE) / len(evidence))
-    weights = special.softmax([*evidence, absent])[:-1]
-    weighted, totals = (weight * moment for weight, moment in zip(weights, moments, strict=True)), []
-    for block in blocks:
-        total = np.zeros_like(block.gram)
-        for group in block.groups:
-            total[np.ix_(group, group)] = sum(itertools.islice(weighted, len(SCALES)))
-        totals.append(total)
-    return totals
+            shrunk = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
+            log_factors = 0.5 * np.sum(
+                shrunk * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0
+            )
+            # Odds of each scale against nothing.
+            odds = np.log(prior / (1.0 - prior) / len(SCALES)) + log_factors / floor**2
+            mean, vector = shrunk * along[:, None], widths[:, None] * vector
+            for weight, variance, c in zip(special.softmax([*odds, 0.0]), shrunk.T, mean.T, strict=False):
+                moment[np.ix_(group, group)] += (
+                    weight * (vector * variance + np.outer(vector @ c, c)) @ vector.T
+                )
+        moments.append(moment)
+    return moments
 
 
 def _root(covariance: Matrix) -> Matrix:
