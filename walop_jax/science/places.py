@@ -69,10 +69,9 @@ class DisagreeingPlace:
 
     def words(self) -> str:
         """The place in a sentence."""
-        details = [
-            f"{c.name} {('brighter', 'fainter')[c.size < 0]} by {with_error(100 * abs(c.size), 100 * c.error)} %"
-            for c in self.alike
-        ]
+        sizes = (with_error(100 * abs(c.size), 100 * c.error) for c in self.alike)
+        words = (f"{c.name} {('brighter', 'fainter')[c.size < 0]}" for c in self.alike)
+        details = [f"{word} by {size} %" for word, size in zip(words, sizes, strict=True)]
         return (
             f"{self.stars} stars near X {self.x:+.3f}°, Y {self.y:+.3f}° (within {2 * self.size:.2g}°) disagree with "
             f"the calibration together, {abs(self.sigma):.0f} σ: {some(details, 4, ' or ')} in the centre. Is there "
@@ -82,10 +81,8 @@ class DisagreeingPlace:
     def document(self) -> dict[str, Any]:
         """The place as plain data."""
         about = {name: getattr(self, name) for name in ("x", "y", "size", "sigma", "stars")}
-        alike = [
-            {"camera": k, "name": entry.name, "size": entry.size, "error": entry.error}
-            for k, entry in zip(self.cameras, self.alike, strict=True)
-        ]
+        pairs = zip(self.cameras, self.alike, strict=True)
+        alike = [{"camera": k, "name": c.name, "size": c.size, "error": c.error} for k, c in pairs]
         return about | {"alike": alike}
 
 
@@ -129,11 +126,8 @@ def places_of(
     `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
-    seen = _seen(
-        stars,
-        stars.residual if residual is None else residual,
-        own_variance(stars) if variance is None else variance,
-    )
+    residual = stars.residual if residual is None else residual
+    seen = _seen(stars, residual, own_variance(stars) if variance is None else variance)
     extent = max(float(np.abs([seen.x, seen.y]).max(initial=0.0)), 1e-9)
     places: list[DisagreeingPlace] = []
     remaining = np.ones(len(seen.x), bool)
