@@ -28,7 +28,6 @@ from walop_jax.posterior.result import (
     Options,
     PosteriorSample,
     Progress,
-    Report,
     assess,
 )
 from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
@@ -37,6 +36,7 @@ from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
 Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
+Report = Callable[[Progress], None] | None
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 OF_LENGTH, OF_SAMPLER = ("maximum_steps", "draws", "checks"), ("sampler", "walkers", "moves")
@@ -118,7 +118,7 @@ class Ensembles:
         return z[:, first:], lnp[:, first:]
 
     def until_converged(
-        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report | None = None
+        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report = None
     ) -> Convergence:
         """Go on until the rules of convergence hold or another block would exceed `maximum_steps`; returns the verdict.
 
@@ -182,7 +182,7 @@ def sample(
     *,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
-    report: Report | None = None,
+    report: Report = None,
 ) -> PosteriorSample:
     """Sample the posterior around a fit until it has converged or `maximum_steps` are done.
 
