@@ -71,12 +71,9 @@ def options_of_commands() -> Mapping[str, Mapping[str, Option]]:
     text = Path(__file__).with_name("options.csv").read_text(encoding="utf-8")
     options: dict[str, dict[str, Option]] = {"*": {}}
     for row in csv.DictReader(io.StringIO(text)):
-        form, kind, least = (
-            Argument if row["FORM"] else Option,
-            KINDS[row["KIND"]],
-            json.loads(row["LEAST"] or "null"),
-        )
-        option = form(row["HELP"], row["METAVAR"] or None, kind, row["SHORT"], bool(row["NEED"]), least)
+        form, least = Argument if row["FORM"] else Option, json.loads(row["LEAST"] or "null")
+        about = row["HELP"], row["METAVAR"] or None, KINDS[row["KIND"]], row["SHORT"]
+        option = form(*about, bool(row["NEED"]), least)
         options.setdefault(row["COMMAND"], {})[row["NAME"]] = option
     return options
 

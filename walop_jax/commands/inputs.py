@@ -150,7 +150,6 @@ def save(
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
-    from walop_jax.io.errors import fail
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT, SUMMARY
     from walop_jax.io.text import json_text

@@ -38,15 +38,8 @@ from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
+from walop_jax.simulation import simulate as simulation
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
-from walop_jax.simulation.simulate import (
-    PhotonNoise,
-    draw_instrument,
-    effect_from_text,
-    fluxes,
-    simulate,
-    truth_values,
-)
 
 NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
 """Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
@@ -128,7 +121,7 @@ def candidates(
     first = np.cumsum([0, *map(len, stops)])
     plan = with_stops(few, itertools.chain(*stops))
     tell("expected counts")
-    calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
+    calset = simulation.simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
     kinds = (*catalogue, *(effect.kind for effect in effects if isinstance(effect, Effect)))
     model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
@@ -136,8 +129,9 @@ def candidates(
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
         values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
-    factor, flux, exptime = _factor(available.plan, few), fluxes(plan, None), plan.exposures().exptime
-    noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
+    factor, flux = _factor(available.plan, few), simulation.fluxes(plan, None)
+    exptime = plan.exposures().exptime
+    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
@@ -180,7 +174,7 @@ def _with(
     for item in given:
         effect = item
         if isinstance(item, str) and "=" in item:
-            effect = effect_from_text(item, context, model.catalogue)
+            effect = simulation.effect_from_text(item, context, model.catalogue)
         alone = isinstance(effect, str)
         name = effect.strip() if isinstance(effect, str) else effect.name
         extended = with_effects(extended, (name if alone else effect,), context)
@@ -220,7 +214,7 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
     samples = []
     for draw in range(draws):
         rng = np.random.default_rng([seed, draw])
-        truth = truth_values(draw_instrument(model, rng))
+        truth = simulation.truth_values(simulation.draw_instrument(model, rng))
         values = np.array([truth[name] for name in model.names])
         if around is not None:
             of = around.model
@@ -281,7 +275,7 @@ class Illumination(NamedTuple):
     """
 
     flux: Float[np.ndarray, " p"]
-    noise: PhotonNoise
+    noise: simulation.PhotonNoise
     floor: float
     shared: Sharing
     scale: float

@@ -141,28 +141,17 @@ class ExposurePlan(Displayed):
 
     def document(self) -> dict[str, Any]:
         """The plan as plain data."""
-        document: dict[str, Any] = {n: getattr(self, n) for n in ("minutes", "seconds")}
-        document |= {"exposures": [dataclasses.asdict(line) for line in self.lines]}
-        document |= {
-            "criterion": self.criterion.name,
-            "what": self.criterion.what,
-            "unit": self.criterion.unit,
-        }
-        document |= {
-            "value": self.value,
-            "bound": self.bound,
-            "gap": self.gap,
-            "gap_of_weights": self.weights_gap,
-        }
-        document |= {n: getattr(self, n) for n in ("any_plate", "truncation", "goal")}
-        document |= {
+        asked = self.criterion
+        document: dict[str, Any] = {
+            "minutes": self.minutes, "seconds": self.seconds,
+            "exposures": [dataclasses.asdict(line) for line in self.lines],
+            "criterion": asked.name, "what": asked.what, "unit": asked.unit, "value": self.value,
+            "bound": self.bound, "gap": self.gap, "gap_of_weights": self.weights_gap,
+            "any_plate": self.any_plate, "truncation": self.truncation, "goal": self.goal,
             "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
-            "draws": len(self.after),
-            "share_below_goal": self.share,
-            "beside": dict(self.beside),
-            "notes": list(self.notes),
-            "plan": self.observing_plan.document(),
-        }
+            "draws": len(self.after), "share_below_goal": self.share, "beside": dict(self.beside),
+            "notes": list(self.notes), "plan": self.observing_plan.document(),
+        }  # fmt: skip
         if self.criterion.name == criteria.WORST:
             document |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
         if len(self.x):

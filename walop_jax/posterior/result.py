@@ -100,26 +100,23 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
 
 def r_hat(chains: Chains) -> Float[np.ndarray, " k"]:
     """R-hat between the halves of all ensembles, per quantity; NaN for a quantity that never moved."""
+    from arviz_stats.base.array import array_stats
+
     e, k = chains.shape[0], chains.shape[-1]
     thinned = chains[:, :: max(1, chains[..., 0].size // RANKED)]
-    rhat: Any = _statistics().rhat
+    rhat: Any = array_stats.rhat
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.array([float(rhat(thinned[..., i].reshape(e, -1))) for i in range(k)])
 
 
 def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
     """Number of independent draws that would give means as good, per quantity."""
-    e, n, w, k = chains.shape
-    walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
-    ess: Any = _statistics().ess
-    return np.array([float(ess(walkers[..., i], method="mean")) for i in range(k)])
-
-
-def _statistics() -> Any:
-    """ArviZ's statistics of arrays, (chain, draw); imported when a posterior is judged."""
     from arviz_stats.base.array import array_stats
 
-    return array_stats
+    e, n, w, k = chains.shape
+    walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
+    ess: Any = array_stats.ess
+    return np.array([float(ess(walkers[..., i], method="mean")) for i in range(k)])
 
 
 def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:

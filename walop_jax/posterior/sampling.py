@@ -19,17 +19,10 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
+from walop_jax.posterior import result as results
 from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
 from walop_jax.posterior.files import Chain
-from walop_jax.posterior.result import (
-    BURN_IN,
-    Chains,
-    Convergence,
-    Options,
-    PosteriorSample,
-    Progress,
-    assess,
-)
+from walop_jax.posterior.result import Chains, Convergence, Options, PosteriorSample, Progress
 from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
 from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
@@ -114,7 +107,7 @@ class Ensembles:
     def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
         """Stored positions and ln p after burn-in."""
         z, lnp, _ = (np.stack(series) for series in zip(*(s[:3] for s in self.stretches), strict=True))
-        first = int(BURN_IN * z.shape[1])
+        first = int(results.BURN_IN * z.shape[1])
         return z[:, first:], lnp[:, first:]
 
     def until_converged(
@@ -128,7 +121,7 @@ class Ensembles:
         while True:
             verdict = None
             if self.blocks:
-                verdict = assess(monitored(self.kept()[0]), tuple(names), self.thin)
+                verdict = results.assess(monitored(self.kept()[0]), tuple(names), self.thin)
                 if verdict.converged or self.steps + self.options.interval > most:
                     return verdict
             if report is not None:

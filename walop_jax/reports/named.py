@@ -12,7 +12,9 @@ from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
-from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures, survey_figures
+from walop_jax.reports import diagnosis_figures as diagnosis
+from walop_jax.reports import figures, posterior_figures, survey_figures
+from walop_jax.reports import paper_figures as paper
 from walop_jax.reports.run import COMPARISON, DATA, SURVEY, FigureSource
 from walop_jax.reports.style import PAGE, PLATES, AnyFigure, texts
 from walop_jax.reports.wording import listed as in_words
@@ -92,7 +94,7 @@ def _trace(source: FigureSource) -> AnyFigure:
 def _signature(source: FigureSource) -> AnyFigure:
     data = source.figure_data
     shown = data.comparisons[source.examined], data.exposures, data.cameras
-    return diagnosis_figures.signature_figure(*shown, source.canvas)
+    return diagnosis.signature_figure(*shown, source.canvas)
 
 
 def _cameras(source: FigureSource) -> tuple[str, ...] | None:
@@ -117,7 +119,7 @@ class NamedFigure(NamedTuple):
 
     draw: Callable[[FigureSource], AnyFigure]
     needs: str = PRODUCT
-    possible: Callable[[FigureSource], bool] = lambda source: True
+    possible: Callable[[FigureSource], object] = lambda source: True
 
 
 def _small(source: FigureSource) -> bool:
@@ -151,35 +153,27 @@ FIGURES: Mapping[str, NamedFigure] = {
     "zero-offset": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 0, s.canvas)),
     "efficiency": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 1, s.canvas)),
     "cross-talk": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)),
-    "retardance": NamedFigure(
-        lambda s: paper_figures.retardance_figure(s.rebuilt, s.canvas), possible=lambda s: bool(_plates(s))
-    ),
+    "retardance": NamedFigure(lambda s: paper.retardance_figure(s.rebuilt, s.canvas), possible=_plates),
     "retardance-wavelength": NamedFigure(
-        lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt, s.canvas),
-        possible=lambda s: bool(_plates(s)),
+        lambda s: paper.retardance_wavelength_figure(s.rebuilt, s.canvas), possible=_plates
     ),
     "coefficients": NamedFigure(
-        lambda s: paper_figures.coefficients_figure(s.calset, s.maps.filter, s.canvas),
-        possible=_angles(len(TERMS)),
+        lambda s: paper.coefficients_figure(s.calset, s.maps.filter, s.canvas), possible=_angles(len(TERMS))
     ),
     "transmission": NamedFigure(
-        lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
+        lambda s: paper.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
         possible=_angles(3),
     ),
     "modulation": NamedFigure(_modulation, possible=_angles(1)),
-    "protection": NamedFigure(lambda s: diagnosis_figures.protection_figure(s.limits, s.canvas), LIMITS),
-    "separation": NamedFigure(lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas), LIMITS),
-    "ladder": NamedFigure(
-        lambda s: diagnosis_figures.ladder_figure(s.figure_data.ladder, s.canvas), FIGURE_DATA
-    ),
+    "protection": NamedFigure(lambda s: diagnosis.protection_figure(s.limits, s.canvas), LIMITS),
+    "separation": NamedFigure(lambda s: diagnosis.separation_figure(s.limits, s.canvas), LIMITS),
+    "ladder": NamedFigure(lambda s: diagnosis.ladder_figure(s.figure_data.ladder, s.canvas), FIGURE_DATA),
     "effect": NamedFigure(
-        lambda s: diagnosis_figures.effect_figure(s.figure_data, s.examined, s.canvas), FIGURE_DATA
+        lambda s: diagnosis.effect_figure(s.figure_data, s.examined, s.canvas), FIGURE_DATA
     ),
     "signature": NamedFigure(_signature, FIGURE_DATA),
-    "rms": NamedFigure(lambda s: diagnosis_figures.rms_figure(s.figure_data, s.canvas), FIGURE_DATA),
-    "shares": NamedFigure(
-        lambda s: diagnosis_figures.shares_figure(s.figure_data.shares, s.canvas), FIGURE_DATA
-    ),
+    "rms": NamedFigure(lambda s: diagnosis.rms_figure(s.figure_data, s.canvas), FIGURE_DATA),
+    "shares": NamedFigure(lambda s: diagnosis.shares_figure(s.figure_data.shares, s.canvas), FIGURE_DATA),
     "residual-map": NamedFigure(_residual_map, possible=lambda s: not _small(s)),
     "residuals": NamedFigure(_residuals, possible=_small),
     "corner": NamedFigure(_corner, POSTERIOR),
@@ -198,12 +192,12 @@ def _tracks(source: FigureSource) -> AnyFigure:
 
 OF_RESULTS: Mapping[str, NamedFigure] = {
     "modulation": NamedFigure(_modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())),
-    "histogram": NamedFigure(lambda s: paper_figures.histogram_figure(s.held[COMPARISON]), COMPARISON),
-    "map": NamedFigure(lambda s: paper_figures.map_figure(s.held[COMPARISON]), COMPARISON),
-    "offset": NamedFigure(lambda s: paper_figures.offset_figure(s.held[COMPARISON]), COMPARISON),
-    "spectral": NamedFigure(lambda s: paper_figures.spectral_figure(s.held[COMPARISON]), COMPARISON),
+    "histogram": NamedFigure(lambda s: paper.histogram_figure(s.held[COMPARISON]), COMPARISON),
+    "map": NamedFigure(lambda s: paper.map_figure(s.held[COMPARISON]), COMPARISON),
+    "offset": NamedFigure(lambda s: paper.offset_figure(s.held[COMPARISON]), COMPARISON),
+    "spectral": NamedFigure(lambda s: paper.spectral_figure(s.held[COMPARISON]), COMPARISON),
     "plate": NamedFigure(
-        lambda s: paper_figures.plate_figure(s.rebuilt),
+        lambda s: paper.plate_figure(s.rebuilt),
         possible=lambda s: CALIBRATION_PLATE in s.rebuilt.model.template.patched().moving(),
     ),
     "tracks": NamedFigure(_tracks, SURVEY),

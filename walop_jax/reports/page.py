@@ -94,10 +94,8 @@ def filled(head: Display, sections: Iterable[Section], *, good: bool, **content:
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **options)
     environment.filters |= {"unit": unit_in_words, "signed": signed}
     filled_sections = [section for section in sections if not section.empty]
-    defaults = dict.fromkeys(("about", "first", "instrument"), "") | dict.fromkeys(
-        ("doubts", "next", "missing"), ()
-    )
-    defaults |= {"versions": {}, "many": MANY}
+    defaults = {**dict.fromkeys(("about", "first", "instrument"), ""), "versions": {}, "many": MANY}
+    defaults |= dict.fromkeys(("doubts", "next", "missing"), ())
     content = defaults | content | {"head": head, "sections": filled_sections, "good": good}
     text = environment.get_template("page.html").render(content)
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)

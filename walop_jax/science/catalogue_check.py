@@ -26,17 +26,9 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.likelihood.inverses import whitening
+from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import star_residuals as residuals
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    MOST_LIKELY,
-    RIVAL,
-    InstrumentChange,
-    PossibleChange,
-    chance_of,
-    profile,
-    threshold,
-)
+from walop_jax.science.instrument_changes import InstrumentChange, PossibleChange, profile
 from walop_jax.science.left_over_sky import LeftOverSky
 from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
@@ -107,7 +99,7 @@ class CatalogueCheck:
     @property
     def alarm(self) -> float:
         """The chance below which a single answer counts."""
-        return ALARM / max(self.asked, 1)
+        return alarms.ALARM / max(self.asked, 1)
 
     @property
     def noise_is_off(self) -> bool:
@@ -230,7 +222,7 @@ class CatalogueSearch:
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown, nuisances = len(self.of_cameras), len(root), self.root.shape[1]
         questions = self.asked = len(self.questions)
-        self._alarm = ALARM / (questions + 2)
+        self._alarm = alarms.ALARM / (questions + 2)
         self.mixing = np.zeros((count + shown + 2, questions + nuisances + 2))
         self.mixing[:questions, :questions] = np.eye(questions)
         self.mixing[count : count + shown, questions : questions + nuisances] = self.root
@@ -293,7 +285,7 @@ class CatalogueSearch:
             if about.worth < residuals.FEW:
                 break
             off = residuals.is_off(about, self._alarm)
-            weighted = look(about, residuals.of_few(about, threshold(self._alarm)) if off else 1.0)
+            weighted = look(about, residuals.of_few(about, alarms.threshold(self._alarm)) if off else 1.0)
         return weighted
 
     def _gains(self, look: _Look) -> tuple[Sizes, int]:
@@ -324,11 +316,13 @@ class CatalogueSearch:
             tests = self._beside(look.matrix, look.score, chosen)
         # The gain change of one camera that raises the alarm in 99 % of cases.
         least = min((t.error for t in tests if t.kind == "gain"), default=np.inf)
-        smallest = (threshold(self._alarm) + MOST_LIKELY) * least if np.isfinite(least) else np.nan
+        factor = alarms.threshold(self._alarm) + alarms.MOST_LIKELY
+        smallest = factor * least if np.isfinite(least) else np.nan
         answers = tests
         while len(chosen) < _MOST_CHANGES:
             strongest = max(range(self.asked), key=lambda n: abs(answers[n].sigma), default=-1)
-            if strongest < 0 or strongest in chosen or chance_of(answers[strongest].sigma) >= self._alarm:
+            new = strongest >= 0 and strongest not in chosen
+            if not new or alarms.chance_of(answers[strongest].sigma) >= self._alarm:
                 break
             chosen.append(strongest)
             look, sizes = self._settled(look, sizes, chosen)
@@ -389,7 +383,7 @@ class CatalogueSearch:
         """True if anything comes near an alarm."""
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
         strongest = max((abs(test.sigma) for test in tests), default=0.0)
-        chances = rows, residuals.chance_of_scale(look.noise), chance_of(strongest)
+        chances = rows, residuals.chance_of_scale(look.noise), alarms.chance_of(strongest)
         return min(chances) < 100.0 * self._alarm
 
     def _settled(
@@ -429,7 +423,7 @@ class CatalogueSearch:
         score = look.score + look.matrix @ away
         measured = self._beside(look.matrix, score, [k for k in chosen if k != asked])
         best = max(measured, key=lambda entry: entry.sigma**2)
-        alike = [entry for entry in measured if entry.sigma**2 > best.sigma**2 - RIVAL]
+        alike = alarms.rivals_of(best, measured)
         # A gain is the simplest of what describes the stars alike.
         ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
         return InstrumentChange(ranked[0], tuple(ranked))

@@ -8,6 +8,7 @@ are given together.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -126,6 +127,11 @@ class PossibleChange(NamedTuple):
             where = f" in a spot at X = {x}°, Y = {y}°, within {2 * self.place[2]:.2g}°"
         size = with_error(100 * abs(self.size), 100 * self.error)
         return f"{name} {('brighter', 'fainter')[lower]} by {size} %{where}"
+
+
+def rivals_of(best: PossibleChange, others: Iterable[PossibleChange]) -> list[PossibleChange]:
+    """Changes that describe the stars as well as the best, it included."""
+    return [entry for entry in others if entry.sigma**2 > best.sigma**2 - RIVAL]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,15 +27,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize
 
 from walop_jax.io.text import some, with_error
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    REACH,
-    RIVAL,
-    Place,
-    PossibleChange,
-    chance_of,
-    profile,
-)
+from walop_jax.science import instrument_changes as alarms
+from walop_jax.science.instrument_changes import Place, PossibleChange, profile
 from walop_jax.science.star_residuals import Residuals, StarResiduals, own_variance
 
 CUT = 3.0
@@ -119,7 +112,7 @@ def places_of(
     cameras: Sequence[str],
     residual: Residuals | None = None,
     variance: OfStars | None = None,
-    alarm: float = ALARM,
+    alarm: float = alarms.ALARM,
 ) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
 
@@ -134,7 +127,7 @@ def places_of(
     while len(places) < _MOST and remaining.sum() > 1:
         subset = seen.of(remaining)
         largest = strongest(subset, extent)
-        if largest.trials * chance_of(largest.sigma) >= alarm:
+        if largest.trials * alarms.chance_of(largest.sigma) >= alarm:
             break
         place = _described(subset, largest, cameras)
         places.append(place)
@@ -237,7 +230,7 @@ def _smoothed(
     index: Int[np.ndarray, " s"], values: OfStars, shape: tuple[int, ...], power: int
 ) -> Float[np.ndarray, " c"]:
     """Sums of values over cells with the weights g (`power` 1) or g² (2)."""
-    reach = _CELLS * int(REACH)
+    reach = _CELLS * int(alarms.REACH)
     kernel = np.exp(-0.5 * power * (np.arange(-reach, reach + 1) / _CELLS) ** 2)
     sums = np.bincount(index, values, minlength=int(np.prod(shape))).reshape(shape)
     for axis in (0, 1):
@@ -257,7 +250,7 @@ def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> Disagree
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike, numbers = [], []
     for (size, error, gain), _, k in fits:
-        if gain > best - RIVAL * max(1.0, scatter):
+        if gain > best - alarms.RIVAL * max(1.0, scatter):
             alike.append(PossibleChange(cameras[k], True, size=size, error=error, kind="spot", place=place))
             numbers.append(k)
     stars = int((profile(subset.x, subset.y, place) > np.exp(-2.0)).sum())

@@ -39,20 +39,12 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import places
 from walop_jax.science import star_residuals as residuals
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    MOST_LIKELY,
-    RIVAL,
-    UNNAMED,
-    History,
-    PossibleChange,
-    profile,
-    threshold,
-)
+from walop_jax.science.instrument_changes import UNNAMED, History, PossibleChange, profile, threshold
 from walop_jax.science.places import Seen, Strongest, fitted
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
 from walop_jax.science.watch_found import Watch, WatchedChange
@@ -172,7 +164,7 @@ class Watching:
         self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
         self.tests = len(self.histories) * self.readings.asked
         # Half of the false alarms are for spots: as many as there are would else take from all others.
-        self.alarm = threshold(0.5 * ALARM / self.tests)
+        self.alarm = threshold(0.5 * alarms.ALARM / self.tests)
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -199,7 +191,7 @@ class Watching:
     def _scaled(self, residual: Residuals, fitted: Float[np.ndarray, " g"]) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
-        dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
+        dof, alarm = self.stars.dof.astype(float), alarms.ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > residuals.CROWDED else 0.0
         overall = residuals.beside_fitted(residuals.noise_scale(chi2, dof), dof, float(fitted.sum()))
         off = residuals.is_off(overall, alarm)
@@ -366,7 +358,8 @@ class Watching:
         # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
-        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
+        largest = special.chdtri(dof, alarms.ALARM / len(dof))
+        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > largest)
         if not odd.any():
             return result
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
@@ -385,7 +378,7 @@ class Watching:
         scale = max(1.0, min(residuals.noise_scale(chi2, dof).value for chi2 in costs))
         cut = special.chdtri(np.maximum(dof, 1e-12), residuals.TRIMMED)
         cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in costs]
-        near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
+        near = abs(cost[1] - cost[0]) < alarms.RIVAL and ways[1][0].best.kind != UNNAMED
         # The simpler one, if both are as good: spots are the first.
         (change, remaining), (alternative, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
         if near:
@@ -412,7 +405,7 @@ class Watching:
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
             before, best = best, ranked[0]
-            alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+            alike = alarms.rivals_of(best, ranked)
             alike = [entry for entry in alike if self.readings.possible(entry)]
             moved = abs(best.size - total) / best.error
             total = best.size
@@ -449,7 +442,7 @@ class Watching:
             trials += here.trials
             if start == 0 or abs(here.sigma) > abs(found[-1][0].sigma):
                 found = [*found[:1], (here, start, seen)]
-        (spot, start, seen), alarm = found[-1], threshold(0.5 * ALARM / max(trials, 1))
+        (spot, start, seen), alarm = found[-1], threshold(0.5 * alarms.ALARM / max(trials, 1))
         if abs(spot.sigma) < alarm:
             return None
         near = seen.near(spot.place)
@@ -473,7 +466,7 @@ class Watching:
         best = ranked[0]
         if abs(best.sigma) < alarm or not self.readings.possible(best):
             return None
-        alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+        alike = alarms.rivals_of(best, ranked)
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
@@ -513,7 +506,7 @@ class Watching:
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
             measured = np.where(information > 0, information, np.nan)
-            smallest[:, k] = (self.alarm + MOST_LIKELY) * measured**-0.5
+            smallest[:, k] = (self.alarm + alarms.MOST_LIKELY) * measured**-0.5
         chi2, dof = self.stars.chi2(self.stars.residual), self.stars.dof.astype(float)
         pairs, ratio = np.unique(self.stars.star * groups + self.group), np.full(groups, np.nan)
         for g in np.unique(self.pool[self.pool < groups]):
@@ -527,7 +520,7 @@ class Watching:
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=whole.value if residuals.is_off(whole, ALARM) else 1.0,
+            noise=whole.value if residuals.is_off(whole, alarms.ALARM) else 1.0,
             tests=self.tests,
             alarm=self.alarm,
         )
