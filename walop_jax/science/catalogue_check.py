@@ -41,6 +41,7 @@ _SETTLED = 0.05  # standard errors
 _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
 _REFERENCE = 1e6  # electron
 
+Matrix = Float[np.ndarray, "c c"]
 Vector = Float[np.ndarray, " r"]  # a number for each row
 Sizes = Float[np.ndarray, " c"]  # of all columns
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
@@ -53,9 +54,7 @@ class Growth(NamedTuple):
     middle: float = 0.0
     half: float = 0.0
 
-    def electrons(
-        self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector
-    ) -> Float[np.ndarray, " r"]:
+    def electrons(self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector) -> Vector:
         """Electrons that a change of `CAMERA_KINDS`, or a spot, of unit size adds to `counts` of its camera."""
         if change.kind == "light":
             return np.ones_like(counts)
@@ -402,9 +401,7 @@ class CatalogueSearch:
             look = self._looked(sizes, stated=stated)
         return look, sizes
 
-    def _beside(
-        self, matrix: Float[np.ndarray, "c c"], score: Sizes, chosen: list[int]
-    ) -> list[PossibleChange]:
+    def _beside(self, matrix: Matrix, score: Sizes, chosen: list[int]) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
@@ -432,7 +429,7 @@ class CatalogueSearch:
 class _Look(NamedTuple):
     noise: Scale
     rows: Scale | None
-    matrix: Float[np.ndarray, "c c"]
+    matrix: Matrix
     score: Sizes
 
 

@@ -126,9 +126,7 @@ def with_rivals(calibration: Calibration) -> Calibration:
     return dataclasses.replace(calibration, model=model, values=values, covariance=covariance, hidden=None)
 
 
-def grouped(
-    time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
-) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
+def grouped(time: Float[np.ndarray, " r"], most: int = MOST_GROUPS) -> tuple[OfGroups, Int[np.ndarray, " r"]]:
     """Times of exposure groups and the group of every row; neighbours of more than `most` groups are joined."""
     times, group = np.unique(time, return_inverse=True)
     if len(times) > most:
@@ -138,6 +136,7 @@ def grouped(
     return times, group.reshape(-1)
 
 
+OfGroups = Float[np.ndarray, " g"]
 Matrix = Float[np.ndarray, "c c"]
 Score = Float[np.ndarray, " c"]
 Settled = tuple[WatchedChange, Residuals]  # a change, and the residuals behind it
@@ -188,7 +187,7 @@ class Watching:
                 weights, _, off = rescaled
         return weights, scale
 
-    def _scaled(self, residual: Residuals, fitted: Float[np.ndarray, " g"]) -> tuple[Weights, Scale, bool]:
+    def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), alarms.ALARM / (len(self.time) + 1)
@@ -213,9 +212,7 @@ class Watching:
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
         return Weights(weight / self.variance, share), overall, several
 
-    def _behind_gains(
-        self, residual: Residuals, weights: Weights, count: int
-    ) -> tuple[Residuals, Float[np.ndarray, " g"]]:
+    def _behind_gains(self, residual: Residuals, weights: Weights, count: int) -> tuple[Residuals, OfGroups]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
