@@ -34,7 +34,7 @@ from walop_jax.reports.named import FIGURES, draw, possible
 from walop_jax.reports.paper_figures import retardance_figure, retardance_wavelength_figure
 from walop_jax.reports.posterior_figures import informed
 from walop_jax.reports.run import FigureSource
-from walop_jax.reports.style import Canvas, element_kind
+from walop_jax.reports.style import Canvas, element_kind, texts
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -202,8 +202,8 @@ def test_map_and_curves_of_the_retardance_agree(source):
 
 def test_plates_go_by_their_names(source):
     """Of an instrument whose first arm has no plate the other one is still HWP2."""
-    assert possible(source)["retardance"].about == "maps of the retardance of HWP1 and HWP2"
-    assert FIGURES["retardance"].about == "maps of the retardance of the half-wave plates"
+    assert possible(source)["retardance"] == "maps of the retardance of HWP1 and HWP2"
+    assert texts("figures")["retardance"] == "maps of the retardance of the half-wave plates"
     whole, first = source.rebuilt, source.rebuilt.model.template.arms[0]
     bare = dataclasses.replace(
         first,
@@ -216,7 +216,7 @@ def test_plates_go_by_their_names(source):
     one = dataclasses.replace(whole, model=model, values=model.start, covariance=np.zeros((n, n)))
     assert [axis.get_title() for axis in retardance_wavelength_figure(one).axes] == ["HWP2"]
     assert retardance_figure(one).axes[0].get_title().startswith("HWP2 at")
-    assert possible(FigureSource.of(one))["retardance"].about == "maps of the retardance of HWP2"
+    assert possible(FigureSource.of(one))["retardance"] == "maps of the retardance of HWP2"
 
 
 def test_retardance_on_the_axis_is_that_of_the_crystals(source):
@@ -278,7 +278,7 @@ def test_plates_are_found_by_their_class(tmp_path):
     calibration = Calibration.from_fit(refit(calset, base_model(calset, design)).judged())
     write_calibration(tmp_path / "calibration.fits", calibration)
     listed = possible(FigureSource(Run(tmp_path)))
-    assert listed["retardance"].about == "maps of the retardance of main.plate"
+    assert listed["retardance"] == "maps of the retardance of main.plate"
 
 
 @pytest.mark.parametrize("dark", [{"axes.facecolor": "black", "text.color": "white", "font.size": 25.0}])

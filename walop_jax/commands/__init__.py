@@ -26,11 +26,9 @@ GROUPS: Mapping[str, Sequence[str]] = {
 }
 """The commands in the groups of the help. `import-zemax` is the function `import_zemax` of `import_zemax.py`."""
 
-COMMANDS = tuple(itertools.chain(*GROUPS.values()))
-"""Every command in the order of the help."""
+COMMANDS = tuple(itertools.chain(*GROUPS.values()))  # every command in the order of the help
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
 
 
 def line_of(name: str) -> str:

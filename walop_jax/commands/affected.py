@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.apply import calibration_for
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, Product
 from walop_jax.commands.tables import named_tables
 from walop_jax.io.names import AFFECTED
@@ -14,21 +13,16 @@ from walop_jax.io.names import AFFECTED
 if TYPE_CHECKING:
     from walop_jax.science.affected import Affected
 
-OLD = Argument("Calibration that the catalogues were reduced with, or its run.", "OLD", Path)
-NEW = Argument("Calibration that takes its place.", "NEW", Path)
-CATALOGUES = Argument("Catalogues, as apply reads or writes them.", "CATALOGUE...", list[Path])
-LIMIT = Option("Shift (standard errors) from which a result is made again (default: 0.5).", "SIGMA", float)
-
 
 @command(stages=("reading", "tabulating"), writes=(AFFECTED,))
 def affected(
     job: Job,
-    old: Annotated[Product, OLD],
-    new: Annotated[Product, NEW],
-    catalogues: Annotated[Any, CATALOGUES],
+    old: Product,
+    new: Product,
+    catalogues: Any,
     *,
-    output: Annotated[PathLike | None, Option(f"Folder for {AFFECTED}.", "RUN", Path, "-o")] = None,
-    limit: Annotated[float, LIMIT] = 0.5,
+    output: PathLike | None = None,
+    limit: float = 0.5,
     effects: Effects = None,
 ) -> Outcome[Affected]:
     """List the catalogues that a new calibration changes, and by how much.

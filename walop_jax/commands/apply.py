@@ -5,22 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import (
-    Argument,
-    Job,
-    Option,
-    Outcome,
-    UsageError,
-    command,
-    command_of,
-    several,
-)
-from walop_jax.commands.each import EACH, SCHEDULER, WORKERS, for_each
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of
+from walop_jax.commands.each import for_each
 from walop_jax.commands.gather import gather
-from walop_jax.commands.inputs import TableFile
 from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming
@@ -31,35 +20,23 @@ if TYPE_CHECKING:
     from walop_jax import Calibration
     from walop_jax.data.user_tables import InputTable
 
-CATALOGUE = Argument(
-    "Table with X, Y, N, N_ERR (in CSV N0, … N0_ERR, … or O1, … O1_ERR, …), or those of the cameras, as for gather.",
-    "CATALOGUE...",
-    list[Path],
-)
-COMMON = Option(
-    "Write the common table of stellar polarisation (Panopoulou et al. 2025), also Galactic q, u."
-)
-DEBIAS = Option("Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", "MAS|WK")
-SATURATION = Option("Counts from here on are not used (FLAG 256).", "ELECTRONS", float)
-FORCE = Option("Also stars whose filter or temperature it does not cover (FLAG 2048).")
-
 
 @command(stages=("reading", "tabulating", "writing"), writes=())
 def apply(
     job: Job,
     calibration: Product,
-    catalogue: Annotated[Any, CATALOGUE],
+    catalogue: Any,
     *,
-    output: TableFile = None,
-    debias: Annotated[str, DEBIAS] = "MAS",
-    saturation: Annotated[float | None, SATURATION] = None,
+    output: PathLike | None = None,
+    debias: str = "MAS",
+    saturation: float | None = None,
     posterior: Posterior = None,
     effects: Effects = None,
-    force: Annotated[bool, FORCE] = False,
-    common: Annotated[bool, COMMON] = False,
-    each: Annotated[bool, EACH] = False,
-    workers: Annotated[int | None, WORKERS] = None,
-    scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
+    force: bool = False,
+    common: bool = False,
+    each: bool = False,
+    workers: int | None = None,
+    scheduler: str | Executor | None = None,
 ) -> Outcome[Any]:
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
@@ -97,17 +74,11 @@ def apply(
     from walop_jax.io.plain_tables import table_format
     from walop_jax.nights.stacking import is_survey
     from walop_jax.posterior.draws import with_moments
+    from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
     from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
-    from walop_jax.science.stokes_columns import (
-        counted_flags,
-        errors_in_words,
-        header,
-        sentences,
-        stokes_columns,
-    )
 
     if (workers is not None or scheduler is not None) and not each:
         raise UsageError("a single table is made by one process; see --each", "workers")
@@ -122,7 +93,7 @@ def apply(
             "calibration": calibration, "debias": debias, "saturation": saturation, "posterior": posterior,
             "effects": effects, "force": force, "common": common,
         }  # fmt: skip
-        return for_each(job, apply, several(catalogue), output, options, workers, scheduler)
+        return for_each(job, apply, catalogue, output, options, workers, scheduler)
     if output is not None:
         check_output(output, overwrite=job.overwrite)
         table_format(output)
@@ -138,21 +109,19 @@ def apply(
         stars = apply_to_rows(used, rows, lambda n, total: job.tell(f"{n} of {total} rows"), force=force)
         seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
-    columns = stokes_columns(stars, rows.star, debias)
+    columns = added.stokes_columns(stars, rows.star, debias)
+    warnings = [*gathering_remarks, *added.sentences(rows, stars, instrument.cameras.names)]
+    warnings += [] if seen_twice is None else seen_twice.warnings()
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     outcome = table_outcome(
         job,
         held,
         table,
         columns,
-        header(held.content_hash(), debias, on_the_sky, stars.check),
+        added.header(held.content_hash(), debias, on_the_sky, stars.check),
         output,
-        counted=counted_flags(rows, used.model.template),
-        warnings=[
-            *gathering_remarks,
-            *sentences(rows, stars, instrument.cameras.names),
-            *([] if seen_twice is None else seen_twice.warnings()),
-        ],
+        counted=added.counted_flags(rows, used.model.template),
+        warnings=warnings,
         remade=_common if common else None,
         extra={
             "stars": len(stars.qu),
@@ -165,15 +134,15 @@ def apply(
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
     stars_of = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
-    text = f"{output}: {stars_of}{errors_in_words(columns)}{zones}"
+    text = f"{output}: {stars_of}{added.errors_in_words(columns)}{zones}"
     return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
 
 
 def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Sequence[str]]:
     """The table of a catalogue, of those of the cameras as one, with remarks on how they were made one."""
-    several = isinstance(catalogue, list | tuple)
-    if not several or len(catalogue) == 1:
-        return table_of(catalogue[0] if several else catalogue, {}), ()
+    given = catalogue if isinstance(catalogue, list | tuple) else [catalogue]
+    if len(given) == 1:
+        return table_of(given[0], {}), ()
     from walop_jax.data.user_tables import in_memory
 
     instrument = None if held is None else held.design

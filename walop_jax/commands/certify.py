@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
 
@@ -14,16 +14,11 @@ if TYPE_CHECKING:
     from walop_jax.science.commissioning import Certificate
 
 DOCUMENT = "commissioning.json"
-FOLDER = Option(f"Folder for {DOCUMENT}; it may be that of the fit.", "RUN", Path, "-o")
 
 
 @command(writes=(DOCUMENT,))
 def certify(
-    job: Job,
-    calibration: Product,
-    effects: Effects = None,
-    *,
-    output: Annotated[PathLike | None, FOLDER] = None,
+    job: Job, calibration: Product, effects: Effects = None, *, output: PathLike | None = None
 ) -> Outcome[Certificate]:
     """Check a calibration from its checksums to its physics and its accuracy: go or no-go, with its shortfalls.
 
@@ -72,9 +67,5 @@ def certify(
     parents = tuple(entry.sha256 for entry in product.inputs)
     certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
     failed = ", ".join(check.name for check in certificate.failed)
-    return Outcome(
-        certificate,
-        saved_as=DOCUMENT,
-        failure=failed and f"{path}: not valid: {failed}",
-        trusted=certificate.go,
-    )
+    failure = failed and f"{path}: not valid: {failed}"
+    return Outcome(certificate, saved_as=DOCUMENT, failure=failure, trusted=certificate.go)

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, command
+from walop_jax.commands.command import Job, Outcome, command
 from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from walop_jax.model.references import Reference
 
-RUN = Argument("Run, or its calibration.fits; default: the base model.", "[RUN]", Path)
-
 
 @command()
 def cite(
-    job: Job,
-    run: Annotated[OptionalProduct, RUN] = None,
-    *,
-    bibtex: Annotated[bool, Option("As BibTeX entries.")] = False,
-    effects: Effects = None,
+    job: Job, run: OptionalProduct = None, *, bibtex: bool = False, effects: Effects = None
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included.
 
@@ -50,8 +44,6 @@ def cite(
             calibration = calibration_of(run if path is None else path, catalogue_of(effects))
             model, filters = calibration.model, calibration.exposures.filter.tolist()
     sources = References((*references(model, filters), Reference("fit", minimise.SOURCE)))
-    return Outcome(
-        sources,
-        [{"what": entry.what, "source": entry.source} for entry in sources],
-        entries(sources, __version__, sampled=sampled) if bibtex else repr(sources),
-    )
+    listed = [{"what": entry.what, "source": entry.source} for entry in sources]
+    text = entries(sources, __version__, sampled=sampled) if bibtex else repr(sources)
+    return Outcome(sources, listed, text)

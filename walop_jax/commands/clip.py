@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, SetFile, Sets, set_and_model
+from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model
 from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
 from walop_jax.io.progress import Stage
@@ -20,8 +20,8 @@ def clip(
     job: Job,
     data: Sets,
     *,
-    output: SetFile = None,
-    sigma: Annotated[float, Option("Standard errors beyond which a row is flagged, at least 3.", "N")] = 5.0,
+    output: PathLike | None = None,
+    sigma: float = 5.0,
     model: ModelLike = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
@@ -48,11 +48,9 @@ def clip(
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects)
     if not isinstance(calset.intensities, TableIntensities) or calset.compression is not None:
-        raise fail(
-            "cannot be clipped",
-            file=calset.inputs[0].path if calset.inputs else IN_MEMORY,
-            advice="only tables of intensities can; of frames the reduction flags cosmic rays, in FLAG",
-        )
+        where = calset.inputs[0].path if calset.inputs else IN_MEMORY
+        advice = "only tables of intensities can; of frames the reduction flags cosmic rays, in FLAG"
+        raise fail("cannot be clipped", file=where, advice=advice)
     with job.repeated() as say:
         say(Stage("fitting", "fitting"))
         flagged = clipped(calset, chosen, sigma)

@@ -2,24 +2,26 @@
 
 The body of a command takes a `Job` and its own arguments, and returns an `Outcome`. The decorator makes two faces of
 it: the Python function, which takes `overwrite`, `progress` and `seed` beside those arguments and returns the value;
-and the command of the program, whose options are the annotated parameters (`program.py`).
+and the command of the program, whose options are the parameters with a row in `options.csv` (`program.py`).
 """
 
 from __future__ import annotations
 
 import builtins
 import contextlib
+import csv
 import dataclasses
 import functools
 import inspect
+import io
+import json
 import logging
 import os
 import sys
 import time
-import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.io.progress import Stage, repeated
 
@@ -56,6 +58,24 @@ class Option:
 
 class Argument(Option):
     """A parameter as an argument of the program, by its position."""
+
+
+KINDS: Mapping[str, Any] = {
+    "path": Path, "paths": list[Path], "text": str, "texts": list[str], "number": float, "integer": int, "": None,
+}  # fmt: skip
+
+
+@functools.cache
+def options_of_commands() -> Mapping[str, Mapping[str, Option]]:
+    """The options of each command by name, of `options.csv`; those of `*` are of all commands with such a parameter."""
+    text = Path(__file__).with_name("options.csv").read_text(encoding="utf-8")
+    options: dict[str, dict[str, Option]] = {"*": {}}
+    for row in csv.DictReader(io.StringIO(text)):
+        form, least = Argument if row["FORM"] else Option, json.loads(row["LEAST"] or "null")
+        about = row["HELP"], row["METAVAR"] or None, KINDS[row["KIND"]], row["SHORT"]
+        option = form(*about, bool(row["NEED"]), least)
+        options.setdefault(row["COMMAND"], {})[row["NAME"]] = option
+    return options
 
 
 class UsageError(ValueError):
@@ -225,15 +245,12 @@ class _Names(dict[str, Any]):
         return getattr(builtins, name, None) or type(name, (), {"__module__": "walop_jax"})
 
 
-def _annotation(function: Callable[..., Any], parameter: inspect.Parameter) -> tuple[Any, Option | None]:
-    """The kind of a parameter and its option, with nothing heavy loaded."""
+def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """The kind of a parameter, with nothing heavy loaded."""
     names = _Names({"Any": Any, "Mapping": Mapping, "PathLike": PathLike, "Sequence": Sequence})
     names.update(vars(sys.modules[function.__module__]))
-    noted = eval(parameter.annotation, {}, names)
-    kind, *notes = typing.get_args(noted) if typing.get_origin(noted) is Annotated else (noted,)
-    if isinstance(kind, typing.ForwardRef):
-        kind = eval(kind.__forward_arg__, {}, names)
-    return kind, next((note for note in reversed(notes) if isinstance(note, Option)), None)
+    kind = eval(parameter.annotation, {}, names)
+    return eval(kind, {}, names) if isinstance(kind, str) else kind
 
 
 @dataclasses.dataclass
@@ -255,10 +272,11 @@ class Command(Generic[T]):
     def __post_init__(self) -> None:
         self.name = self.body.__name__
         self.own, self.options = [], {}
+        options = options_of_commands()
+        options = {**options["*"], **options.get(self.name, {})}
         for p in list(inspect.signature(self.body).parameters.values())[1:]:
-            kind, option = _annotation(self.body, p)
-            self.own.append(p.replace(annotation=kind))
-            self.options |= {} if option is None else {p.name: option}
+            self.own.append(p.replace(annotation=_kind(self.body, p)))
+            self.options |= {p.name: options[p.name]} if p.name in options else {}
         self.elements |= "effects" in self.options
         if self.elements:
             self.options["elements"] = ELEMENTS
@@ -268,12 +286,9 @@ class Command(Generic[T]):
         """The signature of the Python function: its own arguments, then those that all commands share."""
         shared = {"elements": (None, PathLike | Sequence[type] | None, ELEMENTS), **COMMON}
         absent = {"elements": not self.elements, "overwrite": self.writes is None}
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        added = (
-            inspect.Parameter(name, keyword, default=default, annotation=kind)
-            for name, (default, kind, _) in shared.items()
-            if not absent.get(name)
-        )
+        given = {name: entry for name, entry in shared.items() if not absent.get(name)}
+        make = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
+        added = (make(name, default=default, annotation=kind) for name, (default, kind, _) in given.items())
         return inspect.Signature([*self.own, *added])
 
     def bound(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:

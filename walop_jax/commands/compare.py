@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file
-from walop_jax.commands.inputs import Folder, InstrumentLike, ModelLike, Sets, set_and_model, set_of
-from walop_jax.commands.products import (
-    NOT_CARRIED_OVER,
-    Effects,
-    OptionalProduct,
-    calibration_of,
-    left_out_cards,
-    left_out_sentences,
-)
+from walop_jax.commands import products
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model, set_of
 
 if TYPE_CHECKING:
     from walop_jax.paper.comparison import Comparison
@@ -22,21 +14,20 @@ if TYPE_CHECKING:
 DOCUMENT, TABLE = "comparison.json", "comparison.fits"
 FIGURES = ("histogram", "map", "offset", "spectral")
 OUTPUTS = (DOCUMENT, TABLE, *(f"comparison_{name}.png" for name in FIGURES))
-TRUTH = Option("True X, Y, M21 … M33 (FITS, CSV), for simulated sets.", "TABLE", Path)
 
 
 @command(stages=("reading", "fitting", "judging"), writes=OUTPUTS, random=True)
 def compare(
     job: Job,
     data: Sets,
-    calibration: OptionalProduct = None,
+    calibration: products.OptionalProduct = None,
     *,
-    output: Folder = None,
-    truth: Annotated[tuple[Any, Any, Any] | PathLike | None, TRUTH] = None,
-    filter: Annotated[str, Option("Filter to compare in.", "NAME")] = "SDSS-r",
+    output: PathLike | None = None,
+    truth: tuple[Any, Any, Any] | PathLike | None = None,
+    filter: str = "SDSS-r",
     model: ModelLike = None,
     instrument: InstrumentLike = None,
-    effects: Effects = None,
+    effects: products.Effects = None,
 ) -> Outcome[Comparison]:
     """Compare the method of Paper II, as it is published, with the joint fit.
 
@@ -64,7 +55,7 @@ def compare(
     if output is not None and (calibration is not None or isinstance(truth, tuple)):
         raise ValueError("with output the joint fit is repeated: leave out calibration and a truth in memory")
     job.begin("reading")
-    held = None if calibration is None else calibration_of(calibration, effects)
+    held = None if calibration is None else products.calibration_of(calibration, effects)
     if held is None:
         calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     else:
@@ -87,20 +78,16 @@ def compare(
     compared = comparison_of(calset, joint, truth, filter, job.seed)
     lost = joint.left_behind
     columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
-    table = astropy_table(columns, left_out_cards(lost))
-    pictures = {
-        f"comparison_{name}.png": figure_file(getattr(paper_figures, f"{name}_figure"), compared)
-        for name in FIGURES
-    }
+    table = astropy_table(columns, products.left_out_cards(lost))
+    draw = {f"comparison_{name}.png": getattr(paper_figures, f"{name}_figure") for name in FIGURES}
+    pictures = {name: figure_file(figure, compared) for name, figure in draw.items()}
+    doubts = () if trusted else (f"the joint fit: {text}" for text in warnings)
     return Outcome(
         compared,
-        extra={"trusted": trusted, NOT_CARRIED_OVER: list(lost)},
+        extra={"trusted": trusted, products.NOT_CARRIED_OVER: list(lost)},
         below="" if output is None else f"Written to {output}.",
         files={TABLE: lambda path: write_table(path, table), **pictures},
         saved_as=DOCUMENT,
         trusted=trusted,
-        warnings=(
-            *(() if trusted else (f"the joint fit: {text}" for text in warnings)),
-            *left_out_sentences(lost),
-        ),
+        warnings=(*doubts, *products.left_out_sentences(lost)),
     )

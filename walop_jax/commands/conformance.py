@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
 
 if TYPE_CHECKING:
     from walop_jax.science.conformance import Conformance
@@ -16,10 +16,7 @@ RESULTS = "results.csv"
 
 @command(jax=False, writes=())
 def conformance(
-    job: Job,
-    *,
-    make: Annotated[PathLike | None, Option("Write the questions as tables.", "FOLDER", Path)] = None,
-    check: Annotated[PathLike | None, Option("Judge FOLDER/results.csv.", "FOLDER", Path)] = None,
+    job: Job, *, make: PathLike | None = None, check: PathLike | None = None
 ) -> Outcome[int | Conformance]:
     """Put another program to the test: 43 small questions on signs, frames, order of cameras, errors and bias.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, command_of
+from walop_jax.commands.command import Job, Outcome, PathLike, command, command_of
 from walop_jax.commands.refit import STAGES, refit
 from walop_jax.io.errors import fail
 
@@ -16,11 +16,10 @@ if TYPE_CHECKING:
 
 SET, PLAN, SEED = "walop_south_small.fits", "walop_south_small_plan.toml", 2026
 STARS, CORRECTED, COUNT = "stars.fits", "stars_corrected.fits", 200
-FOLDER = Option("Folder to write.", "FOLDER", Path, "-o")
 
 
 @command(stages=STAGES, writes=())
-def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") -> Outcome[FitResult]:
+def demo(job: Job, *, output: PathLike = "walop-jax-demo") -> Outcome[FitResult]:
     """Fit the small calibration set that comes with the package, write its page, and correct stars.
 
     A simulated run of WALOP-South: the set is copied to FOLDER, the fit is FOLDER/RUN, its page FOLDER/RUN/report.html.
@@ -40,23 +39,16 @@ def demo(job: Job, *, output: Annotated[PathLike, FOLDER] = "walop-jax-demo") ->
     fit = command_of(refit).run(job, {"data": [calset], "output": run})
     page = command_of(report).run(job, {"run": run}).value.path
     pull = _stars(job, run, folder)
+    places = {"run": str(run), "page": str(page), "stars": str(folder / CORRECTED)}
+    diagnosis = f"walop-jax diagnose {calset} -o {folder}/DIAGNOSIS"
     return Outcome(
         fit.value,
-        {
-            "run": str(run),
-            "page": str(page),
-            "stars": str(folder / CORRECTED),
-            "pull": pull,
-            "summary": fit.content,
-        },
+        {**places, "pull": pull, "summary": fit.content},
         f"{fit.printed()}\nThe page about it: {page}\n{COUNT} simulated stars corrected with it: {folder / CORRECTED}; "
         f"q and u differ from the truth by {pull:.2f} of their errors (rms)",
         warnings=fit.warnings,
         trusted=fit.trusted,
-        next=(
-            f"walop-jax matrix {run} --x 0.1 --y 0.2",
-            f"walop-jax diagnose {calset} -o {folder}/DIAGNOSIS",
-        ),
+        next=(f"walop-jax matrix {run} --x 0.1 --y 0.2", diagnosis),
     )
 
 

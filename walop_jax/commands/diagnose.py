@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, text_file
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, text_file
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
@@ -16,18 +16,6 @@ if TYPE_CHECKING:
     from walop_jax.diagnosis.findings import Diagnosis
 
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
-MINUTES = Option(
-    "Minutes after which no further name is looked for (default: none; the search ends by itself).",
-    "MINUTES",
-    float,
-    least=0.0,
-)
-WHY = Option(
-    "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
-    "NAME",
-    str,
-)
-RUN = Option("Folder of the results.", "RUN", Path, "-o")
 
 
 @command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
@@ -36,11 +24,11 @@ def diagnose(
     data: Sets,
     model: ModelLike = None,
     *,
-    output: Annotated[PathLike | None, RUN] = None,
+    output: PathLike | None = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
-    minutes: Annotated[float | None, MINUTES] = None,
-    why: Annotated[str | None, WHY] = None,
+    minutes: float | None = None,
+    why: str | None = None,
 ) -> Outcome[Diagnosis]:
     """Find the effects that the model lacks, add them, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from walop_jax.commands.command import Argument, Job, Outcome, UsageError, command
+from walop_jax.commands.command import Job, Outcome, UsageError, command
 from walop_jax.io.errors import nearest
 
-TOPIC = Argument("Page to print, or effect, or element; without it, the list.", "[TOPIC]", str)
-NAME = Argument("Of an effect or a kind of element; none: list them.", "[NAME]", str)
 SINGLE = {
     "effect": "One effect; without a name, the list of all.",
     "element": "One kind of element of an instrument; without a name, the list of all.",
@@ -16,9 +12,7 @@ SINGLE = {
 
 
 @command(jax=False)
-def docs(
-    job: Job, topic: Annotated[str | None, TOPIC] = None, name: Annotated[str | None, NAME] = None
-) -> Outcome[str]:
+def docs(job: Job, topic: str | None = None, name: str | None = None) -> Outcome[str]:
     """Print a reference page, or the list of pages.
 
     Recipes, conventions, file formats, the model, effects, how to add an effect or an instrument, vocabulary, sources;
@@ -41,16 +35,10 @@ def docs(
         width = max(map(len, listed))
         text = "\n".join(f"{key:<{width}}   {words}" for key, words in listed.items())
     elif (text := texts.get(topic.lower().removesuffix(".md"), "")) == "":
-        raise UsageError(
-            f"there is no page {topic!r}; {nearest(topic, (*texts, *SINGLE))} (walop-jax docs lists all)",
-            "topic",
-        )
-    return Outcome(
-        text,
-        {"topic": topic, "name": name, "text": text},
-        text,
-        markdown=topic is not None and (name is not None or topic not in SINGLE),
-    )
+        advice = f"{nearest(topic, (*texts, *SINGLE))} (walop-jax docs lists all)"
+        raise UsageError(f"there is no page {topic!r}; {advice}", "topic")
+    markdown = topic is not None and (name is not None or topic not in SINGLE)
+    return Outcome(text, {"topic": topic, "name": name, "text": text}, text, markdown=markdown)
 
 
 def _single(job: Job, topic: str, name: str | None) -> str:

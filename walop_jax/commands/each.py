@@ -7,23 +7,19 @@ when it is typed again.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command_of
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command_of, several
 from walop_jax.io.errors import DataError
-
-EACH = Option("Each CATALOGUE by itself: OUT is a folder of tables with their names.")
-WORKERS = Option("With --each: in so many processes of this machine, by Dask.", "N", int, least=1)
-SCHEDULER = Option("With --each: on the workers of a Dask cluster that share the files.", "ADDRESS", str)
 
 
 def for_each(
     job: Job,
     command: Callable[..., Any],
-    files: Sequence[PathLike],
+    files: Any,
     output: PathLike | None,
     arguments: Mapping[str, Any],
     workers: int | None = None,
@@ -35,6 +31,7 @@ def for_each(
     """
     from walop_jax.nights.making import executor_of, mapped
 
+    files = several(files)
     if output is None:
         raise UsageError("a folder for the tables is wanted", "output")
     if not all(isinstance(file, str | os.PathLike) for file in files):
@@ -45,11 +42,8 @@ def for_each(
     if any(place.resolve() == Path(file).resolve() for place, file in zip(places, files, strict=True)):
         raise UsageError("the tables would replace the catalogues: give another folder", "output")
     Path(output).mkdir(parents=True, exist_ok=True)
-    calls = [
-        {**arguments, "catalogue": file, "output": place}
-        for file, place in zip(files, places, strict=True)
-        if job.overwrite or not place.exists()
-    ]
+    pairs = [p for p in zip(files, places, strict=True) if job.overwrite or not p[1].exists()]
+    calls = [{**arguments, "catalogue": file, "output": place} for file, place in pairs]
     ended, warnings = [], []
     with executor_of(workers, scheduler) as executor:
         tasks = [(command.__name__, job.overwrite, call) for call in calls]
@@ -88,6 +82,5 @@ def _run(task: tuple[str, bool, dict[str, Any]]) -> Outcome[None]:
             outcome = command.run(Job(overwrite=overwrite), dict(arguments))
     except (DataError, UsageError) as error:
         return Outcome(None, {}, "", failure=str(error))
-    return Outcome(
-        None, outcome.content, outcome.printed(), warnings=outcome.warnings, failure=outcome.failure
-    )
+    said = {"warnings": outcome.warnings, "failure": outcome.failure}
+    return Outcome(None, outcome.content, outcome.printed(), **said)

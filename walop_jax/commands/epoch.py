@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.inputs import Sets, set_of
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
@@ -14,19 +13,12 @@ from walop_jax.io.errors import errors_naming
 if TYPE_CHECKING:
     from walop_jax.science.epoch import Epoch
 
-OLD = Argument("Old calibration product, or folder of a run.", "OLD", Path)
-FOLDER = Option("Folder for the new calibration and the comparison.", "RUN", Path, "-o")
 OUTPUTS = ("calibration.fits", "epoch.json")
 
 
 @command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
 def epoch(
-    job: Job,
-    old: Annotated[Product, OLD],
-    new: Sets,
-    *,
-    output: Annotated[PathLike | None, FOLDER] = None,
-    effects: Effects = None,
+    job: Job, old: Product, new: Sets, *, output: PathLike | None = None, effects: Effects = None
 ) -> Outcome[Epoch]:
     """Fit new calibration sets and compare with an old calibration: is the instrument still the same?
 
@@ -60,14 +52,8 @@ def epoch(
     if comparison.fits is None:
         job.tell("looking for effects that the new fit lacks", "lacking")
         # Other readings of the data have been tried when its fit was examined.
-        lacking = diagnose(
-            calset,
-            result.model,
-            catalogue=catalogue_of(effects),
-            as_written=True,
-            seed=job.seed,
-            progress=job.progress,
-        )
+        options = {"catalogue": catalogue_of(effects), "seed": job.seed, "progress": job.progress}
+        lacking = diagnose(calset, result.model, as_written=True, **options)
         if lacking is not None and lacking.after.trusted:
             result = lacking.after
             comparison = compared(held, result)

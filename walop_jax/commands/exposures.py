@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
-from walop_jax.commands.inputs import TableFile
-
-FILES = Argument("FITS files, a JSON export of a log, a table of words or a schedule.", "FILE...", list[Path])
-WORDS = Option("Which word is which column, which numbers are filters.", "WORDS.toml", Path, required=True)
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
 
 
 @command(writes="file", jax=False)
 def exposures(
     job: Job,
-    files: Annotated[PathLike | Sequence[PathLike], FILES],
+    files: PathLike | Sequence[PathLike],
     *,
-    words: Annotated[PathLike | None, WORDS] = None,
-    output: TableFile = None,
+    words: PathLike | None = None,
+    output: PathLike | None = None,
 ) -> Outcome[Any]:
     """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
@@ -51,10 +47,5 @@ def exposures(
     table = astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
-    document = {
-        "output": output,
-        "exposures": len(table),
-        "columns": list(table.colnames),
-        "remarks": remarks,
-    }
+    document = {"output": output, "exposures": len(table), "columns": table.colnames, "remarks": remarks}
     return Outcome(table, document, f"{output}: {len(table)} exposures", warnings=remarks)

@@ -6,44 +6,30 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command, several
-from walop_jax.commands.inputs import InstrumentLike, TableFile, design_of
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
+from walop_jax.commands.inputs import InstrumentLike, design_of
 
 if TYPE_CHECKING:
     from walop_jax.data.camera_catalogues import CameraCatalogue
     from walop_jax.sky.directions import Pointing
 
-CATALOGUES = Argument("Catalogues of the cameras, in their order: O1 E1 O2 E2.", "CATALOGUE...", list[Path])
-COLUMNS = Option("Names of the columns of another program than SExtractor and photutils.", "FILE.toml", Path)
-CENTRE = "of the field centre (deg); without it that of the header, or of the WCS."
-RA, DEC = Option(f"Right ascension {CENTRE}", kind=float), Option(f"Declination {CENTRE}", kind=float)
-ROTATOR = Option(
-    "Position angle of +X (deg); without it that of the header, or of the axis x of the WCS.", kind=float
-)
-TOLERANCE = Option("Stars farther apart than that are not one (arcsec).", "ARCSEC", least=0.01)
-GAIN = Option("Electrons per count, where fluxes are in counts.", kind=float)
-WORDS = Option(
-    "Words of the header that are FILTER, MJD, CHWP_ANGLE, RA, …, as for exposures.", "WORDS.toml", Path
-)
-GAIA = Option("Table with RA, DEC, SOURCE_ID, BP_RP: who the stars are.", "TABLE", Path)
-
 
 @command(stages=("reading", "matching", "writing"), writes="file", jax=False)
 def gather(
     job: Job,
-    catalogues: Annotated[Sequence[PathLike], CATALOGUES],
+    catalogues: Sequence[PathLike],
     *,
-    output: TableFile = None,
-    columns: Annotated[PathLike | None, COLUMNS] = None,
-    ra: Annotated[float | None, RA] = None,
-    dec: Annotated[float | None, DEC] = None,
-    rotator: Annotated[float | None, ROTATOR] = None,
-    tolerance: Annotated[float, TOLERANCE] = 1.0,
-    gain: Annotated[float | None, GAIN] = None,
-    gaia: Annotated[Any, GAIA] = None,
-    words: Annotated[PathLike | None, WORDS] = None,
+    output: PathLike | None = None,
+    columns: PathLike | None = None,
+    ra: float | None = None,
+    dec: float | None = None,
+    rotator: float | None = None,
+    tolerance: float = 1.0,
+    gain: float | None = None,
+    gaia: Any = None,
+    words: PathLike | None = None,
     instrument: InstrumentLike = None,
 ) -> Outcome[Any]:
     """Make one catalogue, a row a star, of those of the cameras.
@@ -91,17 +77,12 @@ def gather(
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
     by_cameras = [int((gathered_stars.matched == count).sum()) for count in range(len(names) + 1)]
-    document = {
-        "output": output,
-        "stars": len(table),
-        "in_all_cameras": by_cameras[-1],
-        "pointing": cards,
-        "registrations": [
-            {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
-            for name, move in zip(names, gathered_stars.registrations, strict=True)
-        ],
-        "remarks": remarks,
-    }
+    moved = [
+        {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
+        for name, move in zip(names, gathered_stars.registrations, strict=True)
+    ]
+    document = {"output": output, "stars": len(table), "in_all_cameras": by_cameras[-1], "pointing": cards}
+    document |= {"registrations": moved, "remarks": remarks}
     text = f"{output}: {len(table)} stars, {by_cameras[-1]} of them in all {len(names)} cameras"
     next_step = f"walop-jax apply RUN {output} -o OUT.fits"
     return Outcome(table, document, text, warnings=remarks, next=(next_step,))
@@ -136,17 +117,12 @@ def _pointing(
         remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
         missing = []
     if missing:
-        raise fail(
-            f"has no {' and no '.join(missing)} in its header, and no WCS of an image",
-            file=first.path,
-            advice=f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather",
-        )
+        what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
+        advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
+        raise fail(what, file=first.path, advice=advice)
     values = [float(numbers[name]) for name in ("RA", "DEC", "ROTATOR")]  # pyright: ignore[reportArgumentType]
     for name, value, limit in zip(("RA", "DEC", "ROTATOR"), values, (360.0, 90.0, 360.0), strict=True):
         if not abs(value) <= limit:
-            raise fail(
-                f"{name} of the field centre is {value:g} deg",
-                file=first.path,
-                advice=f"at most {limit:g} deg",
-            )
+            what = f"{name} of the field centre is {value:g} deg"
+            raise fail(what, file=first.path, advice=f"at most {limit:g} deg")
     return Pointing(*values), remarks

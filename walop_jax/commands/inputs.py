@@ -9,10 +9,9 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Collection, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, TypeAlias
 
-from walop_jax.commands.command import Argument, Option, PathLike, UsageError
+from walop_jax.commands.command import PathLike, UsageError, several
 from walop_jax.commands.products import Effects, calibration_of, catalogue_of, path_of
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.text import read_text
@@ -22,37 +21,9 @@ if TYPE_CHECKING:
 
 
 GIGABYTE = 1e9
-SETS = Argument("Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path])
-Sets = Annotated["CalibrationSet | PathLike | Sequence[PathLike]", SETS]
-ModelLike = Annotated[
-    "Model | PathLike | None",
-    Option("Model file: parameters free, tied, held; effects added.", "MODEL.toml", Path),
-]
-InstrumentLike = Annotated[
-    "Instrument | PathLike | None",
-    Option(
-        "An instrument that comes with the package, or a description file; see walop-jax instrument.",
-        "NAME|FILE.toml",
-        str,
-    ),
-]
-DataOf = Annotated[
-    "Sequence[PathLike] | None",
-    Option("Calibration set of the fit, if it has moved; again for each.", "CALSET", list[Path]),
-]
-Goal = Annotated[
-    "float | None",
-    Option("Error of p of a star that is wanted, in per cent (default: 0.1).", "PERCENT", float, least=0.0),
-]
-Memory = Annotated["float | None", Option("Memory for the data, in GB.", "GB", float, least=0.1)]
-
-Folder = Annotated["PathLike | None", Option("Folder of the results.", "RUN", Path, "-o", required=True)]
-SetFile = Annotated[
-    "PathLike | None", Option("Calibration set to write (FITS).", "SET.fits", Path, "-o", required=True)
-]
-TableFile = Annotated[
-    "PathLike | None", Option("Table to write (.fits, .csv, .ecsv).", "OUT", Path, "-o", required=True)
-]
+Sets: TypeAlias = "CalibrationSet | PathLike | Sequence[PathLike]"
+ModelLike: TypeAlias = "Model | PathLike | None"
+InstrumentLike: TypeAlias = "Instrument | PathLike | None"
 
 
 def read(
@@ -114,11 +85,10 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
         if not paths:
             raise ValueError("a run is made from files: write the set first, walop_jax.write_calibration_set")
         return paths
-    candidates: Any = data if isinstance(data, list | tuple) else (data,)
-    advice = "a set, the path of one (FITS), or several paths in a list"
-    for candidate in candidates:
-        path_of(candidate, "a calibration set", advice)
-    return tuple(candidates)
+    paths = several(data)
+    for path in paths:
+        path_of(path, "a calibration set", "a set, the path of one (FITS), or several paths in a list")
+    return tuple(paths)
 
 
 def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
@@ -164,10 +134,8 @@ def set_and_model(
     design = design_of(instrument)
     calset = set_of(data, design)
     if output is not None and design is not None and not design.cameras.pairs:
-        raise DataError(
-            f"{design.name}: no arm has two cameras, so there is no instrument matrix and no calibration to write; "
-            "fit it in Python, without output"
-        )
+        what = f"{design.name}: no arm has two cameras, so there is no instrument matrix and no calibration to write"
+        raise DataError(f"{what}; fit it in Python, without output")
     if isinstance(model, Model):
         catalogue = model.catalogue if effects is None else catalogue_of(effects)
         return calset, dataclasses.replace(model, catalogue=catalogue)
@@ -182,7 +150,6 @@ def save(
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
-    from walop_jax.io.errors import fail
     from walop_jax.io.folder import output_folder
     from walop_jax.io.names import PRODUCT, SUMMARY
     from walop_jax.io.text import json_text

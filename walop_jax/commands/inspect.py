@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Outcome, command
-from walop_jax.commands.inputs import SETS, Sets, paths_of
+from walop_jax.commands.command import Job, Outcome, command
+from walop_jax.commands.inputs import Sets, paths_of
 from walop_jax.commands.products import IN_MEMORY
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
@@ -31,15 +31,11 @@ class InspectedSets(Displayed):
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "sets": [
-                {"files": [path], "error": str(inspection)}
-                if isinstance(inspection, DataError)
-                else dataclasses.asdict(inspection)
-                for path, inspection in self.sets
-            ],
-            "joint": None if self.joint is None else dataclasses.asdict(self.joint),
-        }
+        sets = [
+            {"files": [path], "error": str(of)} if isinstance(of, DataError) else dataclasses.asdict(of)
+            for path, of in self.sets
+        ]
+        return {"sets": sets, "joint": None if self.joint is None else dataclasses.asdict(self.joint)}
 
     def display(self) -> Display:
         """The first of the inspections."""
@@ -47,9 +43,7 @@ class InspectedSets(Displayed):
 
 
 @command(jax=False)
-def inspect(
-    job: Job, data: Annotated[Sets, Argument(SETS.help.partition(",")[0] + ".", SETS.metavar, SETS.kind)]
-) -> Outcome[InspectedSets]:
+def inspect(job: Job, data: Sets) -> Outcome[InspectedSets]:
     """List the contents and the faults of calibration sets.
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.

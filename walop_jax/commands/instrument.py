@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.io.errors import errors_naming
-
-SOURCE = Argument("A shipped instrument or a description file; none: list them.", "[NAME|FILE.toml]", str)
-TEXT = Option("Print the description itself, to start one's own from.")
 
 
 @command(jax=False, elements=True)
-def instrument(
-    job: Job, source: Annotated[PathLike | None, SOURCE] = None, *, text: Annotated[bool, TEXT] = False
-) -> Outcome[Any]:
+def instrument(job: Job, source: PathLike | None = None, *, text: bool = False) -> Outcome[Any]:
     """Print and check an instrument: its elements, cameras and parameters, from its description file.
 
     The description is read, every element is made, and light is sent through it on the axis and at the edge of the

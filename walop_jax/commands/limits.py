@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, paths_of, set_and_model
 from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of
 
@@ -15,14 +15,6 @@ if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult, ObservingPlan
     from walop_jax.diagnosis.detection_limits import DetectionLimits
 
-DATA = Argument(
-    "Calibration sets (FITS), fitted as one, or an observing plan in place of them.",
-    "CALSET...|PLAN.toml",
-    list[Path],
-)
-FOLDER = Option(
-    "Folder for limits.json and its two figures; it may be that of a fit of the same sets.", "RUN", Path, "-o"
-)
 OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
 
 
@@ -31,20 +23,17 @@ OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
 )
 def limits(
     job: Job,
-    data: Annotated[
-        FitResult | Diagnosed | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike], DATA
-    ],
+    data: FitResult | Diagnosed | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike],
     model: ModelLike = None,
     *,
-    output: Annotated[PathLike | None, FOLDER] = None,
+    output: PathLike | None = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
 ) -> Outcome[DetectionLimits]:
     """Compute the size at which every effect would be detected and named in calibration sets.
 
-    And what those may be that are too small: the largest error of q and u that a single effect can make over
-    the field without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any
-    data are taken.
+    And what those may be that are too small: the largest error of q and u that a single effect can make over the field
+    without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any data are taken.
 
     In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
     effect and parameter. Raises ValueError for a fit that does not converge.
@@ -77,9 +66,10 @@ def limits(
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     effect_kinds = None if effects is None else catalogue_of(effects)
     limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
-    suggested = (
-        () if output is None else (f"walop-jax report {output}", *_plan(data, output, instrument, result))
-    )
+    suggested = ()
+    if output is not None:
+        suggested = (f"walop-jax report {output}", *_plan(data, output, instrument, result))
+    figures = map(figure_file, (protection_figure, separation_figure), (limits_of_data, limits_of_data))
     return Outcome(
         limits_of_data,
         extra={
@@ -90,10 +80,7 @@ def limits(
             "trusted": result.trusted,
             "seed": job.seed,
         },
-        files={
-            OUTPUTS[1]: figure_file(protection_figure, limits_of_data),
-            OUTPUTS[2]: figure_file(separation_figure, limits_of_data),
-        },
+        files=dict(zip(OUTPUTS[1:], figures, strict=True)),
         saved_as=OUTPUTS[0],
         next=suggested,
         warnings=tuple(f"the fit: {text}" for text in result.warnings),

@@ -4,39 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.products import (
-    FILTER,
-    TEFF,
-    Angles,
-    Effects,
-    Posterior,
-    Product,
-    angles_of,
-    calibration_of,
-)
+from walop_jax.commands import products
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming, fail, nearest
-
-OUT = Option("Table to write (.fits, .csv, .ecsv); needed with --points.", "OUT", Path, "-o")
 
 
 @command(writes="file")
 def matrix(
     job: Job,
-    calibration: Product,
-    x: Annotated[Any, Option("One field point: X (deg).", kind=float)] = None,
-    y: Annotated[Any, Option("The same: Y (deg).", kind=float)] = None,
+    calibration: products.Product,
+    x: Any = None,
+    y: Any = None,
     *,
-    points: Annotated[Any, Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", "TABLE", Path)] = None,
-    output: Annotated[PathLike | None, OUT] = None,
-    posterior: Posterior = None,
-    effects: Effects = None,
-    at: Angles = None,
-    teff: Annotated[Any, TEFF] = None,
-    filter: Annotated[Any, FILTER] = None,
+    points: Any = None,
+    output: PathLike | None = None,
+    posterior: products.Posterior = None,
+    effects: products.Effects = None,
+    at: products.Angles = None,
+    teff: Any = None,
+    filter: Any = None,
 ) -> Outcome[Any]:
     """Give the instrument matrix at a field point, or at every point of a table.
 
@@ -75,10 +64,10 @@ def matrix(
         raise UsageError("name the table to be written", "output")
     if output is not None:
         table_format(output)
-    held = calibration_of(calibration, effects)
+    held = products.calibration_of(calibration, effects)
     instrument = held.model.template.patched()
     moving, columns = instrument.moving(), {}
-    for prefix, angle in angles_of(at).items():
+    for prefix, angle in products.angles_of(at).items():
         if prefix not in moving:
             raise UsageError(f"there is no moving element {prefix!r}; {nearest(prefix, moving)}", "at")
         columns |= {f"{prefix}_IN": True, f"{prefix}_ANGLE": angle}

@@ -5,19 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.inputs import InstrumentLike, design_of, set_of
 from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, Model
-
-SETS = Argument("Calibration sets that the model is for: standards, gauges.", "[CALSET...]", list[Path])
-FILE = Option("File to write; default: stdout.", "MODEL.toml", Path, "-o")
-EFFECT = Option("Add an effect; may be repeated.", "NAME", list[str])
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -30,15 +26,10 @@ class ModelFile(Displayed):
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "instrument": self.model.name,
-            "effects": list(self.model.effect_names),
-            "output": None if self.path is None else str(self.path),
-            "parameters": {
-                p.name: {key: getattr(p, key) for key in ("start", "unit", "prior", "free", "tie", "about")}
-                for p in self.model.parameters
-            },
-        }
+        keys, model = ("start", "unit", "prior", "free", "tie", "about"), self.model
+        document = {"instrument": model.name, "effects": list(model.effect_names)}
+        document |= {"output": None if self.path is None else str(self.path)}
+        return document | {"parameters": {p.name: {k: getattr(p, k) for k in keys} for p in model.parameters}}
 
     def display(self) -> Display:
         """Its file and its size."""
@@ -50,17 +41,16 @@ class ModelFile(Displayed):
 @command(writes="file")
 def model(
     job: Job,
-    calsets: Annotated[CalibrationSet | PathLike | Sequence[PathLike] | None, SETS] = None,
+    calsets: CalibrationSet | PathLike | Sequence[PathLike] | None = None,
     *,
-    output: Annotated[PathLike | None, FILE] = None,
+    output: PathLike | None = None,
     instrument: InstrumentLike = None,
-    effect: Annotated[Sequence[str] | None, EFFECT] = None,
+    effect: Sequence[str] | None = None,
     effects: Effects = None,
 ) -> Outcome[ModelFile]:
     """Write the base model as a file: every parameter with unit, start, prior, free or not.
 
-    With calibration sets, the model that `refit` would fit to them. Change the file and give it to
-    `refit --model`.
+    With calibration sets, the model that `refit` would fit to them. Change the file and give it to `refit --model`.
 
     In Python: a `ModelFile`, whose `model` is the model and `text` the file. Raises ValueError, with the nearest names,
     for an unknown instrument or effect, and for an instrument that is not the sets'.

@@ -8,19 +8,9 @@ import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import (
-    Argument,
-    Job,
-    Option,
-    Outcome,
-    PathLike,
-    UsageError,
-    Writers,
-    command,
-    text_file,
-)
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, text_file
 from walop_jax.commands.products import Effects, calibration_of, catalogue_of
 from walop_jax.commands.standards import LOWEST
 from walop_jax.io.errors import fail
@@ -34,67 +24,23 @@ if TYPE_CHECKING:
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 MOST_ANGLES = 24  # of a moving element, where a plan takes them from a run
 
-SCHEDULE = Option("Write the exposures as a schedule of the survey (format v4).", "FILE.json", Path)
-WORDS = Option("Numbers of filters and facts of a schedule; see walop-jax docs files.", "WORDS.toml", Path)
-FOLDER = Option(f"Folder for {PLAN} and plan.json; without it the plan is printed only.", "RUN", Path, "-o")
-What = Annotated[
-    "ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike",
-    Argument(
-        "Candidate exposures: a plan file, an instrument by name, or the RUN to add to.",
-        "PLAN.toml|INSTRUMENT|RUN",
-        Path,
-    ),
-]
-More = Annotated[Any, Option("Candidate exposures of a RUN or an instrument.", "PLAN.toml", Path)]
-After = Annotated[Any, Option("A calibration that is there already: plan what to add to it.", "RUN", Path)]
-Minutes = Annotated[
-    float,
-    Option("Time for exposures, read-out, pointing and changes, in minutes.", "MINUTES", float, least=0.0),
-]
-Criterion = Annotated[
-    Any,
-    Option(
-        "Quantity to be known best: worst (default: the largest error of p over field and colour), mean, a parameter, "
-        "a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or those that a diagnosis of "
-        "RUN could not separate.",
-        "NAME|TABLE",
-        str,
-    ),
-]
-Goal = Annotated[
-    "float | None",
-    Option("A value of the criterion, in % for errors of p: print the time that it takes.", "VALUE", float),
-]
-Apart = Annotated[
-    Any,
-    Option(
-        "Effect to be separated from the others, NAME=VALUE as for simulate, or NAME alone for one that is a rival "
-        "only. Give it twice or more.",
-        "NAME=VALUE",
-        list[str],
-    ),
-]
-Draws = Annotated[
-    int, Option("Instruments, drawn from the priors, that the plan is made for.", kind=int, least=1)
-]
-
 
 @command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, "plan.json"), random=True)
 def plan(
     job: Job,
-    available: What,
+    available: ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike,
     *,
-    minutes: Minutes = 30.0,
-    candidates: More = None,
-    criterion: Criterion = "worst",
-    goal: Goal = None,
-    after: After = None,
-    apart: Apart = None,
-    draws: Draws = 20,
+    minutes: float = 30.0,
+    candidates: Any = None,
+    criterion: Any = "worst",
+    goal: float | None = None,
+    after: Any = None,
+    apart: Any = None,
+    draws: int = 20,
     effects: Effects = None,
-    schedule: Annotated[PathLike | None, SCHEDULE] = None,
-    words: Annotated[PathLike | None, WORDS] = None,
-    output: Annotated[PathLike | None, FOLDER] = None,
+    schedule: PathLike | None = None,
+    words: PathLike | None = None,
+    output: PathLike | None = None,
 ) -> Outcome[ExposurePlan]:
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
@@ -132,43 +78,27 @@ def plan(
     if candidates is not None:
         available = candidates
     elif available == "" and prior is not None:
-        moving = {
-            prefix: _stood_at(prior.exposures, prefix)
-            for prefix in prior.design.moving()
-            if prefix != CALIBRATION_PLATE
-        }
+        others = (prefix for prefix in prior.design.moving() if prefix != CALIBRATION_PLATE)
+        moving = {prefix: _stood_at(prior.exposures, prefix) for prefix in others}
         design = prior.design if prior.design.description else prior.instrument
         available = ObservingPlan(design, moving=moving)
-    chosen = (
-        read_input_table(criterion)
-        if Path(str(criterion)).suffix and Path(str(criterion)).exists()
-        else criterion
-    )
+    table = Path(str(criterion))
+    chosen = read_input_table(criterion) if table.suffix and table.exists() else criterion
     possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
     possible = possible if schedule is None else possible.in_whole_seconds()
     with job.repeated() as say:
         best = functools.partial(
-            plan_exposures,
-            minutes=minutes,
-            criterion=chosen,
-            known=prior,
-            goal=goal,
-            draws=draws,
-            apart=alike,
-            catalogue=catalogue,
-            seed=job.seed,
-            progress=say,
-        )
+            plan_exposures, minutes=minutes, criterion=chosen, known=prior, goal=goal, draws=draws, apart=alike,
+            catalogue=catalogue, seed=job.seed, progress=say,
+        )  # fmt: skip
         planned = best(possible)
         if possible.doubts(planned.observing_plan):
             with contextlib.suppress(ValueError):  # then the plan is as it is, with its doubts
                 planned = best(dataclasses.replace(possible, throughout=minutes))
     described = planned.observing_plan.design.description
-    files: Writers = {
-        PLAN: text_file(plan_text(planned.observing_plan, INSTRUMENT if described else None)),
-        INSTRUMENT: text_file(described) if described else None,
-    }
+    toml = plan_text(planned.observing_plan, INSTRUMENT if described else None)
+    files = {PLAN: text_file(toml), INSTRUMENT: text_file(described) if described else None}
     remarks = () if schedule is None else scheduled(job, planned.observing_plan, schedule, words)
     return Outcome(planned, extra={"seed": job.seed}, files=files, saved_as=PLANNED, warnings=remarks)
 
@@ -190,16 +120,10 @@ def scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike 
     for number, (_, *place) in known.items():
         ra[stars == number], dec[stars == number] = place
     exposures = dataclasses.replace(exposures, ra=ra, dec=dec)
-    names = [
-        known[s][0]
-        if s in known
-        else planned.star_names[s]
-        if s >= 0
-        else f"Moon at {ra:.2f} {dec:+.2f}"
-        if kind == "moon"
-        else "calibration"
-        for s, kind, ra, dec in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True)
-    ]
+    names = []
+    for s, kind, *place in zip(stars, exposures.kind, exposures.ra, exposures.dec, strict=True):
+        moon = f"Moon at {place[0]:.2f} {place[1]:+.2f}" if kind == "moon" else "calibration"
+        names.append(known[s][0] if s in known else planned.star_names[s] if s >= 0 else moon)
     unpolarised = [name for number, (name, *_) in known.items() if number < planned.unpolarised]
     document, further = schedule_of(
         exposures, planned.site, numbers, facts=rules.schedule, names=names, unpolarised=unpolarised
@@ -254,10 +178,8 @@ def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
     position = exposures.position(prefix)
     stood = np.unique(np.where(position.inside, np.mod(position.angle, 360.0).round(3), np.nan))
     if len(stood) > MOST_ANGLES:
-        raise fail(
-            f"{prefix} stood at {len(stood)} angles, more than could be tried",
-            advice=f"say moving = {{ {prefix} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml",
-        )
+        advice = f"say moving = {{ {prefix} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml"
+        raise fail(f"{prefix} stood at {len(stood)} angles, more than could be tried", advice=advice)
     return tuple(float(angle) if np.isfinite(angle) else None for angle in stood)
 
 
@@ -278,8 +200,5 @@ def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     for step in diagnosis["steps"]:
         if step["equivalent"] and step["effect"] in effects_of_model:
             return (effects_of_model[step["effect"]], *step["equivalent"])
-    raise fail(
-        "the diagnosis left no effects that look alike",
-        file=path,
-        advice="name the effects to be separated with --apart",
-    )
+    advice = "name the effects to be separated with --apart"
+    raise fail("the diagnosis left no effects that look alike", file=path, advice=advice)

@@ -5,33 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.inputs import DataOf
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, CalibrationSet, FitResult, Run
-    from walop_jax.diagnosis.findings import Diagnosis
-    from walop_jax.nights.survey import Survey
-    from walop_jax.paper.comparison import Comparison
-    from walop_jax.posterior.result import PosteriorSample
-
-    Drawable = (
-        FitResult | Calibration | Diagnosis | PosteriorSample | Run | Comparison | Survey | CalibrationSet
-    )
+    from walop_jax.reports.run import Drawable
 
 FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
-RUN = Argument("Folder of results; none: list the figures.", "[RUN]", Path)
-NAME = Argument("The figure.", "[NAME]", str)
-FILE = Option("File to write: .pdf, .png, .svg (default: NAME.png).", "FILE", Path, "-o")
-STEP = Option("Effect of a diagnosis (effect, signature); 0: starting and final model.", least=0)
-PARAMETERS = Option("Coefficients of a corner or trace plot, by name.", "A,B,…", str)
-WIDTH = Option(
-    "Width in print, with type of 7 pt: column (89 mm), page (183 mm), or in mm.", "column|page|MM", str
-)
 
 
 class Figures(dict[str, str]):
@@ -45,16 +28,16 @@ class Figures(dict[str, str]):
 @command(writes=())
 def plot(
     job: Job,
-    run: Annotated[Drawable | PathLike | None, RUN] = None,
-    name: Annotated[str | None, NAME] = None,
+    run: Drawable | PathLike | None = None,
+    name: str | None = None,
     *,
-    output: Annotated[PathLike | None, FILE] = None,
-    parameters: Annotated[str | Sequence[str] | None, PARAMETERS] = None,
-    x: Annotated[Any, Option("Field point of transmission and modulation, X (deg).", kind=float)] = 0.0,
-    y: Annotated[Any, Option("The same, Y (deg).", kind=float)] = 0.0,
-    step: Annotated[int, STEP] = 1,
-    width: Annotated[float | str | None, WIDTH] = None,
-    data: DataOf = None,
+    output: PathLike | None = None,
+    parameters: str | Sequence[str] | None = None,
+    x: Any = 0.0,
+    y: Any = 0.0,
+    step: int = 1,
+    width: float | str | None = None,
+    data: Sequence[PathLike] | None = None,
     effects: Effects = None,
     ax: Any = None,
     figsize: tuple[float, float] | None = None,
@@ -78,22 +61,19 @@ def plot(
     """
     from walop_jax import Run
     from walop_jax.io.atomic import check_output
+    from walop_jax.io.run_folder import OF_A_FIT
     from walop_jax.reports.named import FIGURES, draw, possible
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.run import FigureSource
-    from walop_jax.reports.style import Canvas
+    from walop_jax.reports.style import Canvas, texts
 
     catalogue = catalogue_of(effects)
     held = Run(Path(run), catalogue, tuple(data or ())) if isinstance(run, str | os.PathLike) else run
     if isinstance(held, Run) and not held.folder.is_dir():
-        raise fail(
-            "is not the folder of a run",
-            file=held.folder,
-            advice="give the RUN of walop-jax refit or diagnose",
-        )
+        raise fail("is not the folder of a run", file=held.folder, advice=OF_A_FIT)
     if held is None or name is None:
-        figures = FIGURES if held is None else possible(FigureSource.of(held))
-        listed = Figures({key: entry.about for key, entry in figures.items()})
+        every = {key: texts("figures")[key] for key in FIGURES}
+        listed = Figures(every if held is None else possible(FigureSource.of(held)))
         return Outcome(listed, listed, repr(listed))
     chosen = f"{name}.png" if output is None and job.typed else output
     path = None if chosen is None else Path(chosen)
@@ -104,14 +84,8 @@ def plot(
     if isinstance(parameters, str):
         parameters = [word.strip() for word in parameters.split(",") if word.strip()]
     job.tell(f"drawing {name}")
-    source = FigureSource.of(
-        held,
-        parameters=tuple(parameters or ()),
-        place=(x, y),
-        step=step,
-        reference=reference,
-        canvas=Canvas(ax, figsize, _inches(width)),
-    )
+    options = {"parameters": tuple(parameters or ()), "place": (x, y), "step": step, "reference": reference}
+    source = FigureSource.of(held, **options, canvas=Canvas(ax, figsize, _inches(width)))
     figure = draw(name, source)
     if path is not None:
         save_figure(path, figure, overwrite=job.overwrite, exact=width is not None)

@@ -11,9 +11,9 @@ import os
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from walop_jax.commands.command import Argument, Option, PathLike, UsageError
+from walop_jax.commands.command import PathLike, UsageError
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.io.text import in_ascii
 
@@ -32,39 +32,16 @@ class Diagnosed(Protocol):
         ...
 
 
-IN_MEMORY = "in memory"
-"""In place of the path of a file."""
+IN_MEMORY = "in memory"  # in place of the path of a file
 
 NOT_CARRIED_OVER = "not_carried_over"
 """Key under which results in JSON list the effects of a model that had to be left out."""
 
-TEFF = Option("Colour temperature (K); without it, a flat spectrum.", kind=float)
-FILTER = Option("Filter of the calibration, or SDSS-r.", kind=str)
-EFFECTS = Option(
-    "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
-    "FILE.toml|.py",
-    Path,
-)
-
-Effects = Annotated["PathLike | Sequence[EffectKind] | None", EFFECTS]
-Product = Annotated[
-    "Calibration | FitResult | Diagnosed | Run | PathLike",
-    Argument("Calibration product, or the folder of a run.", "RUN/calibration.fits", Path),
-]
-OptionalProduct = Annotated["Calibration | FitResult | Diagnosed | Run | PathLike | None", None]
-"""Of commands that do without one; each adds its own option."""
-Posterior = Annotated[
-    "PosteriorSample | Any | PathLike | None",
-    Option("Use draws of walop-jax sample, not the covariance.", "posterior.nc", Path),
-]
-Angles = Annotated[
-    "Mapping[str, float] | Sequence[str] | None",
-    Option(
-        "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
-        "P=ANGLE",
-        list[str],
-    ),
-]
+Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
+Product: TypeAlias = "Calibration | FitResult | Diagnosed | Run | PathLike"
+OptionalProduct: TypeAlias = "Calibration | FitResult | Diagnosed | Run | PathLike | None"
+Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
+Angles: TypeAlias = "Mapping[str, float] | Sequence[str] | None"
 
 
 def catalogue_of(effects: Effects) -> tuple[EffectKind, ...]:
@@ -104,11 +81,8 @@ def calibration_of(given: Product, effects: Effects = None) -> Calibration:
 
 def folder_of(run: Run | PathLike) -> Path:
     """The folder of a run, or whatever else a path names."""
-    return path_of(
-        getattr(run, "folder", run),
-        "a run or a calibration",
-        "a fit, a Run, or the path of a folder or a product",
-    )
+    advice = "a fit, a Run, or the path of a folder or a product"
+    return path_of(getattr(run, "folder", run), "a run or a calibration", advice)
 
 
 def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:
@@ -128,10 +102,8 @@ def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float
 def left_out_sentences(names: Sequence[str], source: PathLike | None = None) -> tuple[str, ...]:
     """A sentence for every effect that cannot be carried over; `source` is the file that the model comes from."""
     where = "" if source is None else f"{os.fspath(source)}: "
-    return tuple(
-        f"{where}{name} acts on single exposures of the calibration, which cannot be carried over; it is left out"
-        for name in names
-    )
+    why = "acts on single exposures of the calibration, which cannot be carried over; it is left out"
+    return tuple(f"{where}{name} {why}" for name in names)
 
 
 def left_out_cards(names: Sequence[str]) -> dict[str, str]:

@@ -25,8 +25,7 @@ STARTED = time.perf_counter()
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
 LINE_EVERY = 10.0  # s, of progress that is no terminal's
 WIDEST = 120  # columns: longer lines are hard to read
-UNTRUSTED = 3
-"""Exit code of a command that has written a result which is not to be trusted."""
+UNTRUSTED = 3  # exit code of a command that has written a result which is not to be trusted
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 EXIT_CODES = (
@@ -51,6 +50,7 @@ NEXT = {
 """Commands to type next, where a command itself does not say; names are those of its arguments."""
 
 PRINTED = "prints its result and takes no output: keep it with > FILE, with --json for programs"
+KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
 INTO_ARGUMENT = "writes into the folder that it is given: leave -o out"
 
 QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
@@ -146,14 +146,9 @@ def _parameter(name: str, option: Option, default: Any, hidden: bool = False) ->
     if isinstance(option, Argument):
         note = typer.Argument(**shown)
     else:
-        names = (f"--{name.replace('_', '-')}", *([option.short] if option.short else []))
-        note = typer.Option(*names, **shown)
-    return inspect.Parameter(
-        name,
-        inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if needed else default,
-        annotation=Annotated[kind, note],
-    )
+        note = typer.Option(*filter(None, (f"--{name.replace('_', '-')}", option.short)), **shown)
+    given = inspect.Parameter.empty if needed else default
+    return inspect.Parameter(name, KEYWORD_ONLY, default=given, annotation=Annotated[kind, note])
 
 
 def _command(name: str) -> Any:
@@ -238,11 +233,8 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
 
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
     """The lines of `NEXT` for the given arguments; those that need an output which was not written are left out."""
-    words = {
-        name: " ".join(map(str, value)) if isinstance(value, list) else str(value)
-        for name, value in given.items()
-        if value is not None
-    }
+    texts = ((name, value if isinstance(value, list) else [value]) for name, value in given.items())
+    words = {name: " ".join(map(str, values)) for name, values in texts if values != [None]}
     lines = NEXT.get(command.name, ())
     return tuple(line.format_map(words) for line in lines if set(re.findall(r"{(\w+)}", line)) <= set(words))
 
@@ -305,7 +297,7 @@ def progress(quiet: bool, stages: Sequence[str] = ()) -> Iterator[Callable[[str]
     """Give a function that shows progress and time on stderr: on a terminal in a line that goes.
 
     Elsewhere a line is printed when there has been none for `LINE_EVERY` seconds. `stages` are those of the work, in
-    their order: they are counted. A message with its share of the work (`share`) moves a bar.
+    their order: they are counted.
     """
     if quiet:
         yield lambda message: None

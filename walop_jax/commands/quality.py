@@ -5,32 +5,26 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, several
+from walop_jax.commands.command import Job, Outcome, PathLike, command, several
 from walop_jax.commands.products import Diagnosed, Effects, calibration_of
 from walop_jax.io.display import Display
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
 
-RUNS = Argument("Runs or calibrations, one for each night.", "RUN...", list[Path])
-TABLE = Option(
-    "Table that the nights are added to (.ecsv, .csv, .fits).", "QUALITY.ecsv", Path, "-o", required=True
-)
-LIMITS = Option("Limits in place of those of the package.", "LIMITS.toml", Path)
-FIGURE = Option("Draw all nights of the table: .png, .pdf, .svg.", "FILE", Path)
 SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 
 
 @command(stages=("reading", "writing"))
 def quality(
     job: Job,
-    runs: Annotated[Calibration | FitResult | Diagnosed | Run | PathLike | Sequence[Any], RUNS],
+    runs: Calibration | FitResult | Diagnosed | Run | PathLike | Sequence[Any],
     *,
-    output: Annotated[PathLike | None, TABLE] = None,
-    limits: Annotated[PathLike | None, LIMITS] = None,
-    figure: Annotated[PathLike | None, FIGURE] = None,
+    output: PathLike | None = None,
+    limits: PathLike | None = None,
+    figure: PathLike | None = None,
     effects: Effects = None,
 ) -> Outcome[Any]:
     """Add a row of quality numbers for each night to a table, and list those outside their limits.
@@ -82,16 +76,9 @@ def quality(
         (f"{row['NIGHT']:.0f}", *(f"{row[name]:.4g}" for name in SHOWN), str(row[OUTSIDE])) for row in mine
     )
     title = f"{output or 'Quality numbers'}: {len(table)} night{'s' if len(table) != 1 else ''}"
-    return Outcome(
-        table,
-        {
-            "output": output,
-            "nights": [{name: row[name] for name in table.colnames} for row in mine],
-            "limits": {name: list(pair) for name, pair in allowed.items()},
-            "outside": out,
-            "remarks": [*remarks, *table_remarks],
-        },
-        display=Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown),
-        warnings=(*remarks, *table_remarks, *out),
-        trusted=not out,
-    )
+    remarks += table_remarks
+    nights = [{name: row[name] for name in table.colnames} for row in mine]
+    document = {"output": output, "nights": nights, "limits": {n: list(pair) for n, pair in allowed.items()}}
+    document |= {"outside": out, "remarks": remarks}
+    display = Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown)
+    return Outcome(table, document, display=display, warnings=(*remarks, *out), trusted=not out)

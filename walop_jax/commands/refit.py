@@ -4,54 +4,40 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Option, Outcome, PathLike, command
-from walop_jax.commands.inputs import (
-    GIGABYTE,
-    Folder,
-    Goal,
-    InstrumentLike,
-    Memory,
-    ModelLike,
-    Sets,
-    goal_of,
-    paths_of,
-    set_and_model,
-)
+from walop_jax.commands import inputs
+from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult
 
-COMPRESS = Option("Write whole frames as a small set with the same information.", "SET.fits", Path)
-STAGES = ("reading", "fitting", "examining", "mapping")
-"""Of the progress, also of the commands that fit and do more."""
+STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
 @command(stages=STAGES, writes=(), random=True)
 def refit(
     job: Job,
-    data: Sets,
-    model: ModelLike = None,
+    data: inputs.Sets,
+    model: inputs.ModelLike = None,
     *,
-    output: Folder = None,
-    instrument: InstrumentLike = None,
+    output: PathLike | None = None,
+    instrument: inputs.InstrumentLike = None,
     effects: Effects = None,
-    memory: Memory = 2.0,
-    compress: Annotated[PathLike | None, COMPRESS] = None,
-    goal: Goal = None,
+    memory: float | None = 2.0,
+    compress: PathLike | None = None,
+    goal: float | None = None,
 ) -> Outcome[FitResult]:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
     RUN is created if necessary. If it holds a calibration already, the command stops unless --overwrite is given;
     then these two files are replaced and all others stay.
 
-    A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that
-    converges but is not to be trusted (it does not explain the data, a parameter lies far from its prior, the
-    residuals hold patterns or differ between parts of the data) is written with TRUSTED = F and warnings, exit
-    code 3.
+    A fit that does not converge leaves RUN/summary.failed.json, no calibration, and exit code 1. One that converges but
+    is not to be trusted (it does not explain the data, a parameter lies far from its prior, the residuals hold patterns
+    or differ between parts of the data) is written with TRUSTED = F and warnings, exit code 3.
 
     The first lines give the error of p of a star, whether it is good enough for --goal, and what to do if
     not; the calibration may make half of the goal.
@@ -87,25 +73,27 @@ def refit(
         check_output(compress, overwrite=job.overwrite)
     with job.reserved(output, (PRODUCT, SUMMARY)) as job:
         job.begin("reading")
-        calset, chosen = set_and_model(data, model, instrument, effects, output=output)
+        calset, chosen = inputs.set_and_model(data, model, instrument, effects, output=output)
         with job.repeated() as say:
-            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else memory * GIGABYTE)
+            bytes_of = None if memory is None else memory * inputs.GIGABYTE
+            fitted = fit(calset, chosen, progress=say, memory=bytes_of)
             say(Stage("looking for patterns in the residuals", "examining"))
-            result = answered(examined(fitted, job.seed), goal=goal_of(goal) or GOAL)
+            result = answered(examined(fitted, job.seed), goal=inputs.goal_of(goal) or GOAL)
         if compress is not None:
             write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
         is_written = output is not None
         mapped = is_written and result.likelihood.layout.large and result.converged
         residuals = residual_map(result) if mapped else None
         misfit = describe(result) if is_written and not result.explains_data else None
-        brief = dataclasses.replace(result.display(), rows=(), notes=())
+        shown = dataclasses.replace(result.display(), notes=result.notes)
+        brief = dataclasses.replace(shown, rows=(), notes=()).text()
         judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
         outcome = Outcome(
             result,
             summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
             extra={"seed": job.seed},
-            display=dataclasses.replace(result.display(), notes=result.notes),
-            text=None if result.trusted else f"{brief.text()}\n{judged}",
+            display=shown,
+            text=None if result.trusted else f"{brief}\n{judged}",
             below=judged,
             files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
             saved_as=SUMMARY,
@@ -135,21 +123,21 @@ def _compressed(result: FitResult) -> CalibrationSet:
     from walop_jax.likelihood.frames import PixelExpansion
 
     if not isinstance(result.expansion, PixelExpansion):
-        raise fail(
-            "cannot be compressed",
-            file=result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY,
-            advice="only whole frames of many pixels can, under a model that is smooth over the field, with detectors "
-            "that report counts as they are; tables and small frames are small enough as they are",
+        where = result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY
+        advice = (
+            "only whole frames of many pixels can, under a model that is smooth over the field, with detectors that "
+            "report counts as they are; tables and small frames are small enough as they are"
         )
+        raise fail("cannot be compressed", file=where, advice=advice)
     if not result.converged:
         raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
-def next_steps(trusted: bool, output: PathLike | None, data: Sets, **options: object) -> tuple[str, ...]:
+def next_steps(trusted: bool, output: Any, data: inputs.Sets, **options: object) -> tuple[str, ...]:
     """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
     if trusted:
         return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
-    sets = " ".join(str(path) for path in paths_of(data)) if output is not None else "CALSET"
+    sets = " ".join(str(path) for path in inputs.paths_of(data)) if output is not None else "CALSET"
     typed = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
     return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{typed} -o {output}_diagnosis")

@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import (
-    Argument,
-    Job,
-    Option,
-    Outcome,
-    PathLike,
-    UsageError,
-    command,
-    command_of,
-)
-from walop_jax.commands.inputs import DataOf, Goal, goal_of, save
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import goal_of, save
 from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
 from walop_jax.io.display import Display, Displayed
 
@@ -26,8 +18,6 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
-RUN = Argument("Folder of results, of whichever command.", "RUN", Path)
-FILE = Option("Page to write (default: RUN/report.html).", "FILE", Path, "-o")
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -50,12 +40,12 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
-    output: Annotated[PathLike | None, FILE] = None,
+    run: FitResult | Diagnosed | Run | PathLike,
+    output: PathLike | None = None,
     *,
-    data: DataOf = None,
+    data: Sequence[PathLike] | None = None,
     effects: Effects = None,
-    goal: Goal = None,
+    goal: float | None = None,
 ) -> Outcome[Page]:
     """Write one HTML page about a run, figures inside: it needs no network and no other file, and can be mailed or
     printed.
@@ -71,24 +61,31 @@ def report(
 
     >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
-    from walop_jax import FitResult, Run
+    from walop_jax import FitResult
     from walop_jax.commands.diagnose import write
-    from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.text import encodable
-    from walop_jax.reports.page import kind_of_run, render, render_other
-    from walop_jax.reports.run import read_run
 
     if isinstance(fit_of(run), FitResult):
         if output is None:
             raise UsageError("give output, the folder for the page of a fit in memory", "output")
         with tempfile.TemporaryDirectory() as temporary:
-            if isinstance(run, FitResult):
-                save(run, Path(temporary) / "fit")
-            else:
-                write(run, Path(temporary) / "fit")  # pyright: ignore[reportArgumentType]
-            return command_of(report).body(job, Path(temporary) / "fit", output, effects=effects, goal=goal)
+            written: Any = save if isinstance(run, FitResult) else write
+            written(run, Path(temporary) / "fit")
+            return _page(job, Path(temporary) / "fit", Path(output), effects=effects, goal=goal)
     folder = folder_of(run)  # pyright: ignore[reportArgumentType]
     target = folder / PAGE if output is None else Path(output)
+    return _page(job, folder, target, data, effects, goal)
+
+
+def _page(
+    job: Job, folder: Path, target: Path, data: Any = (), effects: Effects = None, goal: float | None = None
+) -> Outcome[Page]:
+    """Write the page about a folder."""
+    from walop_jax import Run
+    from walop_jax.io.atomic import atomic_path, check_output
+    from walop_jax.io.text import encodable
+    from walop_jax.reports.page import kind_of_run, render, render_other
+    from walop_jax.reports.run import read_run
+
     job.begin("reading")
     kind = kind_of_run(folder)
     contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
@@ -99,8 +96,7 @@ def report(
     text = encodable(text)
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    page = Page(target, len(text.encode()), missing)
-    return Outcome(page)
+    return Outcome(Page(target, len(text.encode()), missing))
 
 
 def _is_page(path: Path) -> bool:

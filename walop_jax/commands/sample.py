@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command
-from walop_jax.commands.inputs import DataOf, ModelLike
+from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.inputs import ModelLike
 from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
 from walop_jax.io.text import json_text, read_text
@@ -18,10 +17,7 @@ if TYPE_CHECKING:
     from walop_jax import FitResult, Options, Run
     from walop_jax.posterior.result import PosteriorSample, Progress
 
-RUN = Argument("Folder of a `walop-jax refit`.", "RUN", Path)
-STEPS = Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1)
-CHAINS = "sampling"
-"""Folder, in that of the run, of the chain that is kept."""
+CHAINS = "sampling"  # folder, in that of the run, of the chain that is kept
 NOT_CONVERGED = "the posterior has not converged; calibration.fits keeps its covariance"
 OUTPUTS = (
     "posterior.nc", "posterior.fits", "posterior.ecsv", "posterior_corner.png", "posterior_trace.png", "sample.json",
@@ -31,20 +27,18 @@ OUTPUTS = (
 @command(writes=(), random=True)
 def sample(
     job: Job,
-    fit: Annotated[FitResult | Diagnosed | Run | PathLike, RUN],
+    fit: FitResult | Diagnosed | Run | PathLike,
     *,
-    resume: Annotated[bool, Option("Go on from the chain in RUN/sampling (emcee).")] = False,
+    resume: bool = False,
     model: ModelLike = None,
-    data: DataOf = None,
+    data: Sequence[PathLike] | None = None,
     effects: Effects = None,
-    sampler: Annotated[Any, Option("emcee, nuts, or your own as FILE.py:CLASS.", "NAME", str)] = "emcee",
-    inflate: Annotated[bool, Option("Sample a factor on the errors of the data.")] = False,
-    maximum_steps: Annotated[int, STEPS] = 100_000,
-    walkers: Annotated[int, Option("Walkers of an emcee ensemble; 0: at least 64.", least=0)] = 0,
-    interval: Annotated[
-        int, Option("Steps after which convergence is judged and the chain kept.", least=1)
-    ] = 500,
-    moves: Annotated[str, Option("Moves of emcee: laplace, de or stretch.")] = "laplace",
+    sampler: Any = "emcee",
+    inflate: bool = False,
+    maximum_steps: int = 100_000,
+    walkers: int = 0,
+    interval: int = 500,
+    moves: str = "laplace",
     parameters: Sequence[str] | None = None,
     options: Options | None = None,
 ) -> Outcome[PosteriorSample]:
@@ -64,15 +58,9 @@ def sample(
     from walop_jax import FitResult, Options, Run
     from walop_jax.posterior.sampling import sample as sample_fit
 
+    shown = None if parameters is None else tuple(parameters)
     options = options or Options(
-        sampler=sampler,
-        seed=job.seed,
-        inflate=inflate,
-        maximum_steps=maximum_steps,
-        walkers=walkers,
-        interval=interval,
-        moves=moves,
-        parameters=None if parameters is None else tuple(parameters),
+        sampler, job.seed, walkers, interval, maximum_steps, moves=moves, inflate=inflate, parameters=shown
     )
 
     def tell(progress: Progress) -> None:
@@ -93,12 +81,8 @@ def sample(
         where = folder_of(fit)  # pyright: ignore[reportArgumentType]
         run = Run(where, catalogue_of(effects), tuple(data or ()))
         posterior = _sampled_run(job, run, options, tell, model, resume)
-    return Outcome(
-        posterior,
-        warnings=(*anew, *posterior.warnings),
-        failure="" if posterior.sampled_well else f"{where}: {NOT_CONVERGED}",
-        trusted=posterior.trusted,
-    )
+    failure, warnings = "" if posterior.sampled_well else f"{where}: {NOT_CONVERGED}", posterior.warnings
+    return Outcome(posterior, warnings=(*anew, *warnings), failure=failure, trusted=posterior.trusted)
 
 
 def _sampled_run(
@@ -125,9 +109,8 @@ def _sampled_run(
     text = None if model is None else read_text(model)
     existing = [name for name in OUTPUTS if (folder / name).exists()]
     if existing and not (job.overwrite or resume):
-        raise fail(
-            f"holds {existing[0]} already", file=folder, advice="go on with --resume, or --overwrite it"
-        )
+        advice = "go on with --resume, or --overwrite it"
+        raise fail(f"holds {existing[0]} already", file=folder, advice=advice)
     with output_folder(folder, OUTPUTS, overwrite=True) as out:
         product = read_calibration(folder / PRODUCT, run.catalogue)
         result = run.fit(text)

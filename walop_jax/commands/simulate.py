@@ -6,10 +6,10 @@ import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike, SetFile, design_of
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.inputs import InstrumentLike, design_of
 from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of, left_out_sentences
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
@@ -19,42 +19,21 @@ if TYPE_CHECKING:
     from walop_jax.simulation.simulate import Simulated
     from walop_jax.simulation.truth import Template
 
-PLAN = Argument("Observing plan (TOML); default: the usual one of the instrument.", "[PLAN.toml]", Path)
-STARS = Option(
-    "Make a catalogue of so many stars in place of the set: of the same instrument.", "N", int, least=1
-)
-CAMERAS = Option(
-    "With --stars: catalogues of the cameras as well, as SExtractor writes them (STARS_O1.fits, …), for gather."
-)
-EFFECT = Option(
-    "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
-    "value per element), NAME alone where there is none to give. May be repeated.",
-    "NAME=VALUE",
-    list[str],
-)
-LIKE = Option(
-    "Another night of the same instrument: a run as fitted, or the truth of a simulated set. Instrument and catalogue "
-    "are those; --effect changes the instrument, --seed draws weather and noise.",
-    "RUN|TRUTH.json",
-    Path,
-)
-NIGHT = Option("Number of the night: days after the date of the plan.", "N", int, least=0)
-
 
 @command(stages=("following", "writing"), writes=(), random=True)
 def simulate(
     job: Job,
-    plan: Annotated[ObservingPlan | PathLike | None, PLAN] = None,
+    plan: ObservingPlan | PathLike | None = None,
     *,
-    output: SetFile = None,
+    output: PathLike | None = None,
     instrument: InstrumentLike = None,
-    effect: Annotated[str | Sequence[str | Effect] | Mapping[str, Any] | None, EFFECT] = None,
+    effect: str | Sequence[str | Effect] | Mapping[str, Any] | None = None,
     effects: Effects = None,
-    like: Annotated[Simulated | FitResult | Diagnosed | Calibration | Run | PathLike | None, LIKE] = None,
-    night: Annotated[int | None, NIGHT] = None,
-    truth: Annotated[PathLike | None, Option("Write the true parameters here.", "FILE.json", Path)] = None,
-    stars: Annotated[int | None, STARS] = None,
-    cameras: Annotated[bool, CAMERAS] = False,
+    like: Simulated | FitResult | Diagnosed | Calibration | Run | PathLike | None = None,
+    night: int | None = None,
+    truth: PathLike | None = None,
+    stars: int | None = None,
+    cameras: bool = False,
     noiseless: bool = False,
     catalogue_seed: int | None = None,
 ) -> Outcome[Simulated]:
@@ -171,13 +150,8 @@ def simulate(
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
         about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
-    return Outcome(
-        data,
-        about,
-        text,
-        warnings=left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None),
-        next=suggested,
-    )
+    warnings = left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None)
+    return Outcome(data, about, text, warnings=warnings, next=suggested)
 
 
 def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
@@ -212,12 +186,11 @@ def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> S
     """Effects as the command line writes them, of a dict: {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}."""
     if not isinstance(effect, Mapping):
         return (effect,) if isinstance(effect, str) else effect or ()
-    return [
-        f"{name}={','.join(f'{key}:{value}' for key, value in sizes.items())}"
-        if isinstance(sizes, Mapping)
-        else f"{name}={sizes}"
-        for name, sizes in effect.items()
-    ]
+    texts = []
+    for name, sizes in effect.items():
+        several = isinstance(sizes, Mapping)
+        texts.append(f"{name}={','.join(f'{k}:{v}' for k, v in sizes.items()) if several else sizes}")
+    return texts
 
 
 _LISTED = 12  # numbers of a parameter that are listed

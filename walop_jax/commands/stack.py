@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, UsageError, command, several
+from walop_jax.commands.command import Job, Outcome, UsageError, command, several
 from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
 
 if TYPE_CHECKING:
@@ -13,26 +13,19 @@ if TYPE_CHECKING:
 
     from walop_jax.nights.survey import Survey
 
-NIGHTS = Argument("Calibration sets, folders of refit, or a SURVEY.", "NIGHT...", list[Path])
-LAWS = Option("Model file with [law] tables (default: that of the first fit).", "MODEL.toml", Path)
-LIKE = Option("Fit with the model of all nights (default: the first RUN or SURVEY given).", "RUN", Path)
-WORKERS = Option("Make nights in so many processes of this machine, by Dask.", "N", int, least=1)
-SCHEDULER = Option("Make nights on the workers of a Dask cluster that share the files.", "ADDRESS", str)
-SURVEY = Option("Folder of the survey.", "SURVEY", Path, "-o", required=True)
-
 
 @command(stages=("reading", "stacking"), writes=())
 def stack(
     job: Job,
-    nights: Annotated[Any, NIGHTS],
-    laws: Annotated[Any, LAWS] = None,
+    nights: Any,
+    laws: Any = None,
     *,
-    like: Annotated[OptionalProduct, LIKE] = None,
-    events: Annotated[Any, Option("Table of works on the instrument: MJD, WHAT.", "TABLE", Path)] = None,
-    no_breaks: Annotated[bool, Option("Do not look for breaks.")] = False,
-    workers: Annotated[int | None, WORKERS] = None,
-    scheduler: Annotated[str | Executor | None, SCHEDULER] = None,
-    output: Annotated[Any, SURVEY] = None,
+    like: OptionalProduct = None,
+    events: Any = None,
+    no_breaks: bool = False,
+    workers: int | None = None,
+    scheduler: str | Executor | None = None,
+    output: Any = None,
     effects: Effects = None,
 ) -> Outcome[Survey]:
     """Fit many nights at once, each parameter under a law of its change with time.
@@ -43,11 +36,10 @@ def stack(
     at the values of a fit, and again at the common solution; its normal equations are kept, so that it need not be read
     again.
 
-    SURVEY holds the nights (nights.fits), every parameter against time (tracks.fits), the calibration of the last
-    night (calibration.fits), that about which nights are linearised, with the laws (reference.fits), and survey.json.
-    Nights that are made stay in SURVEY/partial until the end: the same command resumes an interrupted stack.
-    walop-jax apply SURVEY takes the calibration of the MJD of its stars. Exit code 3 if the laws do not explain the
-    nights.
+    SURVEY holds the nights (nights.fits), every parameter against time (tracks.fits), the calibration of the last night
+    (calibration.fits), that about which nights are linearised, with the laws (reference.fits), and survey.json. Nights
+    that are made stay in SURVEY/partial until the end: the same command resumes an interrupted stack. walop-jax apply
+    SURVEY takes the calibration of the MJD of its stars. Exit code 3 if the laws do not explain the nights.
 
     Nights are made by Dask on a cluster, or in processes of this machine, with --scheduler or --workers: the survey is
     the same to the last digit, and a worker that is lost is replaced (walop-jax docs nights).
@@ -78,12 +70,7 @@ def stack(
             catalogue=catalogue_of(effects),
         )
         stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
-        outcome = Outcome(
-            survey,
-            files=writers(survey),
-            saved_as=FILES[-1],
-            next=(f"walop-jax report {output}", *stars),
-            warnings=survey.verdict.warnings,
-            trusted=survey.trusted,
-        )
+        judged = {"warnings": survey.verdict.warnings, "trusted": survey.trusted}
+        steps = (f"walop-jax report {output}", *stars)
+        outcome = Outcome(survey, files=writers(survey), saved_as=FILES[-1], next=steps, **judged)
         return outcome if job.folder is None else outcome.save(job.folder, drop=(PARTIAL,))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
+from walop_jax.commands.command import Job, Outcome, UsageError, command
 from walop_jax.commands.inputs import InstrumentLike
 
-NEAR = Option("Sorted by the distance from a direction (deg); one number for each.", "RA,DEC", str)
-UP = Option("Those above 30° at a time (UTC) at the site of the instrument, the highest first.", "MJD", float)
 LOWEST = 30.0  # deg
 
 
@@ -16,8 +14,8 @@ LOWEST = 30.0  # deg
 def standards(
     job: Job,
     *,
-    near: Annotated[str | tuple[float, float] | None, NEAR] = None,
-    up: Annotated[float | None, UP] = None,
+    near: str | tuple[float, float] | None = None,
+    up: float | None = None,
     instrument: InstrumentLike = None,
 ) -> Outcome[Any]:
     """List standard stars with band, errors, variability and source.

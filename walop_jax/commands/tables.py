@@ -81,12 +81,6 @@ def table_outcome(
         **(extra or {}),
     }
     about = (f"{counts[bit]} {sentence}" for bit, sentence in counted.items() if sentence and counts[bit])
-    return Outcome(
-        extended_table,
-        document,
-        warnings=(
-            *held.warnings,
-            *left_out_sentences(lost, held.path),
-            *(f"{table.path}: {sentence}" for sentence in (*remarks, *other_remarks, *warnings, *about)),
-        ),
-    )
+    of_table = (f"{table.path}: {text}" for text in (*remarks, *other_remarks, *warnings, *about))
+    sentences = (*held.warnings, *left_out_sentences(lost, held.path), *of_table)
+    return Outcome(extended_table, document, warnings=sentences)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Argument, Job, Option, Outcome, PathLike, command, figure_file
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.commands.tables import named_tables
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch
 
-CATALOGUES = Argument("FITS, CSV or ECSV with X, Y, N, N_ERR, and MJD.", "CATALOGUE...", list[Path])
-FOLDER = Option("Folder for watch.json, watch.fits and watch.png.", "RUN", Path, "-o")
-FORCE = Option("Also stars whose filter or temperature the calibration does not cover.")
 OUTPUTS = ("watch.json", "watch.fits", "watch.png")
 
 
@@ -22,11 +18,11 @@ OUTPUTS = ("watch.json", "watch.fits", "watch.png")
 def watch(
     job: Job,
     calibration: Product,
-    catalogues: Annotated[Any, CATALOGUES],
+    catalogues: Any,
     *,
-    output: Annotated[PathLike | None, FOLDER] = None,
+    output: PathLike | None = None,
     effects: Effects = None,
-    force: Annotated[bool, FORCE] = False,
+    force: bool = False,
 ) -> Outcome[Watch]:
     """Find when a calibration became invalid, from the stars of many nights: no calibration exposures are needed.
 
@@ -55,13 +51,12 @@ def watch(
     job.tell("tabulating the analysis vectors", "tabulating")
     with errors_naming(", ".join(names)):
         history = watched(held, rows, names=names, force=force)
+    table = history.to_table()
+    writers = (lambda path: table.write(path, format="fits"), figure_file(watch_figure, history))
     return Outcome(
         history,
         extra={"product": held.content_hash()},
-        files={
-            OUTPUTS[1]: lambda path: history.to_table().write(path, format="fits"),
-            OUTPUTS[2]: figure_file(watch_figure, history),
-        },
+        files=dict(zip(OUTPUTS[1:], writers, strict=True)),
         saved_as=OUTPUTS[0],
         warnings=held.warnings,
         trusted=history.holds,

@@ -28,8 +28,12 @@ from scipy import linalg
 
 from walop_jax.model.laws import Form, Law
 
+Laws = Sequence[Law | None]
+Border = Float[np.ndarray, "_ _"]
+OfUnits = Float[np.ndarray, "u n"]
+
 Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
+Matrix = Border
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Equations:
     night: Int[np.ndarray, " u"]
     file: Int[np.ndarray, " u"]
     chi2: Float[np.ndarray, " u"]
-    gradient: Float[np.ndarray, "u n"]
+    gradient: OfUnits
     matrix: Float[np.ndarray, "u n n"]
     scale: Float[np.ndarray, " n"]
 
@@ -80,10 +84,10 @@ class Eliminated(NamedTuple):
     """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
     block: Matrix
-    border: Float[np.ndarray, "_ _"]
-    before: Float[np.ndarray, "_ _"]
+    border: Border
+    before: Border
     factor: tuple[Matrix, bool]  # of S_c
-    left: Float[np.ndarray, "_ _"]  # B'_c
+    left: Border  # B'_c
     right: Vector  # r'_c
 
 
@@ -104,12 +108,7 @@ class System:
 
     @classmethod
     def of(
-        cls,
-        equations: Equations,
-        laws: Sequence[Law | None],
-        mean: Vector,
-        width: Vector,
-        means: Bool[np.ndarray, " n"],
+        cls, equations: Equations, laws: Laws, mean: Vector, width: Vector, means: Bool[np.ndarray, " n"]
     ) -> System:
         """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
         scale, forms = equations.scale, []
@@ -151,25 +150,16 @@ class System:
 
 
 def _cells(
-    equations: Equations,
-    laws: Sequence[Law | None],
-    local: Sequence[int],
-    mean: Vector,
-    width: Vector,
-    spread: Vector,
+    equations: Equations, laws: Laws, local: Sequence[int], mean: Vector, width: Vector, spread: Vector
 ) -> tuple[Cell, ...]:
     label = equations.night.copy()
     if any(laws[i].base == "file" for i in local):  # type: ignore[union-attr]
         for _ in range(len(label)):
-            low, high = (
-                np.array([function(label[equations.file == f]) for f in range(equations.file.max() + 1)])
-                for function in (np.min, np.max)
-            )
             joined = label.copy()
-            for first, last in zip(low, high, strict=True):
-                joined[(label >= first) & (label <= last)] = np.minimum(
-                    joined[(label >= first) & (label <= last)], first
-                )
+            for f in range(equations.file.max() + 1):
+                of_file = label[equations.file == f]
+                between = (label >= of_file.min()) & (label <= of_file.max())
+                joined[between] = np.minimum(joined[between], of_file.min())
             if np.array_equal(joined, label):
                 break
             label = joined
@@ -194,12 +184,8 @@ def _cells(
                 means.append(prior[0])
                 precisions.append(prior[1])
                 times.append(equations.mjd[units][groups == group].mean() if law.base == "walk" else np.nan)
-        cells.append(
-            Cell(
-                units, np.array(parameter, int), np.array(covers).reshape(-1, len(units)), np.array(means, float),
-                np.array(precisions, float), np.array(times, float),
-            )
-        )  # fmt: skip
+        held = (np.array(values, float) for values in (means, precisions, times))
+        cells.append(Cell(units, np.array(parameter, int), np.array(covers).reshape(-1, len(units)), *held))
     return tuple(cells)
 
 
@@ -213,9 +199,8 @@ class UndeterminedError(ValueError):
 
 def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | None) -> tuple[Matrix, bool]:
     """The Cholesky factor; `UndeterminedError` names the first parameter that has nothing left."""
-    factor, failed = linalg.lapack.dpotrf(  # pyright: ignore[reportAttributeAccessIssue]
-        matrix, lower=1, clean=1
-    )
+    potrf: Any = linalg.lapack.dpotrf  # pyright: ignore[reportAttributeAccessIssue]
+    factor, failed = potrf(matrix, lower=1, clean=1)
     if failed:
         raise UndeterminedError(int(parameters[failed - 1]), unit)
     small = np.diag(factor) ** 2 < 1e-14 * np.maximum(np.diag(matrix), 1e-300)
@@ -258,11 +243,8 @@ def solve(system: System) -> Solution:
         left_block, reduced, remainder = block, border, rhs
         if last is not None and coupling.any():
             gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
-            left_block, reduced, remainder = (
-                block - gain @ coupling.T,
-                border - gain @ last.left,
-                rhs - gain @ last.right,
-            )
+            left_block, reduced = block - gain @ coupling.T, border - gain @ last.left
+            remainder = rhs - gain @ last.right
         factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(rhs) else (left_block, True)
         last = Eliminated(block, border, coupling, factor, reduced, remainder)
         done.append(last)
@@ -282,7 +264,7 @@ def solve(system: System) -> Solution:
     return Solution(system, shared, tuple(values), tuple(done), factor)
 
 
-def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"], Vector]:
+def _block(system: System, cell: Cell) -> tuple[Matrix, Border, Vector]:
     """Own block, border and right side of a cell: priors and data, without walks."""
     e, p = system.equations, cell.parameter
     block = np.diag(cell.precision)
@@ -296,9 +278,7 @@ def _block(system: System, cell: Cell) -> tuple[Matrix, Float[np.ndarray, "_ _"]
     return block, border, right
 
 
-def _walks(
-    system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]
-) -> Float[np.ndarray, "_ _"]:
+def _walks(system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]) -> Border:
     """Add the steps of walks that end in a cell to its block and the one before; the coupling of both."""
     coupling = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd)))
     for k in np.flatnonzero(np.isfinite(cell.mjd)):
@@ -332,7 +312,7 @@ class Solution:
     factor: tuple[Matrix, bool]
 
     @functools.cached_property
-    def values(self) -> Float[np.ndarray, "u n"]:
+    def values(self) -> OfUnits:
         """The parameters in every unit, from the origin, scaled."""
         system = self.system
         values = np.zeros((len(system.equations), len(system.laws)))
@@ -344,7 +324,7 @@ class Solution:
         return values
 
     @functools.cached_property
-    def slopes(self) -> Float[np.ndarray, "u n"]:
+    def slopes(self) -> OfUnits:
         """Half the gradient of χ² of every unit with respect to its parameters, at the solution."""
         e = self.system.equations
         return e.gradient + (e.matrix @ self.values[:, :, None])[:, :, 0]
@@ -426,9 +406,8 @@ class Solution:
         extra = np.zeros(n)
         value = np.zeros(n)
         nights = [system.equations.night[cell.units] for cell in system.cells]
-        current = next(
-            (c for c, members in enumerate(nights) if night is not None and night in members), None
-        )
+        numbered = (c for c, members in enumerate(nights) if night is not None and night in members)
+        current = next(numbered, None)
         for i, law in enumerate(system.laws):
             if law is None or law.base not in ("night", "file", "walk"):
                 continue
@@ -501,7 +480,7 @@ class Solution:
                 joint[size + a, size + b] = joint[size + b, size + a] = value
         return joint
 
-    def errors(self) -> Float[np.ndarray, "u n"]:
+    def errors(self) -> OfUnits:
         """Standard errors of the parameters in every unit, scaled."""
         system = self.system
         variance = np.zeros_like(self.values)
@@ -522,7 +501,6 @@ class Solution:
                 for k, i in enumerate(cell.parameter):
                     units = cell.units[cell.covers[k] > 0]
                     mine = np.flatnonzero(system.at == i)
-                    variance[units, i] += (
-                        block[k, k] + 2.0 * system.basis[np.ix_(units, mine)] @ cross[k, mine]
-                    )
+                    shared_part = system.basis[np.ix_(units, mine)] @ cross[k, mine]
+                    variance[units, i] += block[k, k] + 2.0 * shared_part
         return np.sqrt(np.clip(variance, 0.0, None))

@@ -39,8 +39,8 @@ SURE = 5.0  # standard errors that keep one name from another
 MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
-Carried = Callable[[Parameter], bool]
-"""True for a candidate that stars can be corrected for."""
+Carried = Callable[[Parameter], bool]  # true for a candidate that stars can be corrected for
+Laws = Sequence[Law | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,12 +92,9 @@ class Break:
         if self.kind == "drift":
             # A candidate that drifts has a value as well.
             return (law or Law(() if gauge else ("shared",))).adding("linear")
-        law = law or Law(())
-        return (
-            law.adding("step", self.date)
-            if self.kind == "step"
-            else law.adding("bad", self.before, self.after)
-        )
+        if self.kind == "step":
+            return (law or Law(())).adding("step", self.date)
+        return (law or Law(())).adding("bad", self.before, self.after)
 
 
 def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -121,10 +118,8 @@ class Tried(NamedTuple):
         n = len(solution.system.laws)
         course = np.repeat(((e.mjd - e.mjd.mean()) / YEAR)[:, None], n, axis=1)
         score, information = changes.weighted(solution, course, np.arange(n))
-        return cls(
-            (scan.step_score, scan.once_score, score[None]),
-            (scan.step_information, scan.once_information, np.diag(information)[None]),
-        )
+        scores = scan.step_score, scan.once_score, score[None]
+        return cls(scores, (scan.step_information, scan.once_information, np.diag(information)[None]))
 
     def without(self, barred: Sequence[int]) -> Tried:
         """The same but for some parameters."""
@@ -135,9 +130,9 @@ class Tried(NamedTuple):
 
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
-        information = self.information[kind]
+        informed = self.information[kind] > 0
         return np.where(
-            information > 0, self.score[kind] / np.sqrt(np.where(information > 0, information, 1.0)), 0.0
+            informed, self.score[kind] / np.sqrt(np.where(informed, self.information[kind], 1.0)), 0.0
         )
 
     def chance(self, u: float) -> float:
@@ -167,16 +162,13 @@ class Tried(NamedTuple):
         return kind, int(cell), int(parameter)
 
 
-def solved(data: Together, laws: Sequence[Law | None]) -> Solution:
+def solved(data: Together, laws: Laws) -> Solution:
     """The solution of nights under laws. Raises `UndeterminedError` where there is none."""
     return solve(System.of(data.equations, laws, data.mean, data.width, data.has_value))
 
 
 def find(
-    data: Together,
-    laws: Sequence[Law | None],
-    catalogue: Sequence[EffectKind] = EFFECTS,
-    carried: Carried | None = None,
+    data: Together, laws: Laws, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...], Solution]:
     """The breaks of a series, the laws with them, and the solution under these.
 
@@ -217,7 +209,7 @@ def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     return one
 
 
-def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Break]) -> tuple[Law | None, ...]:
+def with_breaks(data: Together, laws: Laws, found: Sequence[Break]) -> tuple[Law | None, ...]:
     """Laws with breaks."""
     changed = list(laws)
     for entry in found:
@@ -226,7 +218,7 @@ def with_breaks(data: Together, laws: Sequence[Law | None], found: Sequence[Brea
     return tuple(changed)
 
 
-def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
+def _other_shapes(data: Together, laws: Laws) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
     shapes: dict[str, tuple[int, int] | None] = {}
     for p, law in zip(data.parameters, laws, strict=True):
@@ -234,11 +226,8 @@ def _other_shapes(data: Together, laws: Sequence[Law | None]) -> list[int]:
             shapes[p.part] = None
         elif law is not None:
             shapes.setdefault(p.part, p.shape)
-    return [
-        i
-        for i, p in enumerate(data.parameters)
-        if isinstance(p, EffectAmplitude) and shapes.get(p.part, p.shape) != p.shape
-    ]
+    amplitudes = ((i, p) for i, p in enumerate(data.parameters) if isinstance(p, EffectAmplitude))
+    return [i for i, p in amplitudes if shapes.get(p.part, p.shape) != p.shape]
 
 
 def _largest(
@@ -319,7 +308,7 @@ def _nights_needed(solution: Solution, at: tuple[int, int, int], rivals: Sequenc
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
 
-def _held_out(data: Together, laws: Sequence[Law | None], one: Break) -> float:
+def _held_out(data: Together, laws: Laws, one: Break) -> float:
     """Gain in χ² of every other night by the size that the others give; NaN where that cannot be asked."""
     i, halves = data.names.index(one.name), []
     for odd in (0, 1):

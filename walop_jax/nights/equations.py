@@ -43,9 +43,7 @@ from walop_jax.sky.nights import night_of
 
 OF_ONE_SET = ("moon_patch", "standard_outlier")
 """Effects that belong to single exposures, or are parameters of the base model already: no candidates."""
-MOST_SHAPES = (
-    4  # of an effect whose shapes are all candidates: cameras and plates, not places and thicknesses
-)
+MOST_SHAPES = 4  # of an effect whose shapes are all candidates: cameras, plates, not places, thicknesses
 OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make
 SIDEREAL = 1.00273791  # sidereal hours in an hour
 CLOCK = 0.2, 0.05  # hours by which hour angles disagree with MJD, and their scatter: signs of another clock
@@ -101,10 +99,8 @@ def night_numbers(mjd: Float[np.ndarray, " e"], site: Site) -> Int[np.ndarray, "
     Raises `DataError` for an exposure without a time.
     """
     if np.any(bad := ~np.isfinite(mjd)):
-        raise DataError(
-            f"[EXPOSURES] MJD: not given in {int(bad.sum())} of {len(mjd)} exposures, so that they belong to no night; "
-            "add the times (UTC)"
-        )
+        what = f"not given in {int(bad.sum())} of {len(mjd)} exposures, so that they belong to no night"
+        raise DataError(f"[EXPOSURES] MJD: {what}; add the times (UTC)")
     return night_of(mjd, site.longitude).astype(int)
 
 
@@ -117,10 +113,8 @@ def check_clock(exposures: Exposures, site: Site) -> None:
     off = (np.mod(sidereal - exposures.ra[sky] - 15.0 * exposures.ha[sky] + 180.0, 360.0) - 180.0) / 15.0
     shift = float(np.median(off)) / SIDEREAL
     if abs(shift) > CLOCK[0] and np.median(np.abs(off / SIDEREAL - shift)) < CLOCK[1]:
-        raise DataError(
-            f"[EXPOSURES] MJD: is {shift:+.2f} h from UTC, as HA and RA of {int(sky.sum())} exposures say: is "
-            "the clock in local time? Correct MJD"
-        )
+        what = f"is {shift:+.2f} h from UTC, as HA and RA of {int(sky.sum())} exposures say"
+        raise DataError(f"[EXPOSURES] MJD: {what}: is the clock in local time? Correct MJD")
 
 
 def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> CalibrationSet:
@@ -131,15 +125,10 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
     if not isinstance(intensities, TableIntensities) or calset.compression is not None:
         raise DataError("frames of several nights are in one set; give each night as a file of its own")
     rows, place = keep[intensities.exposure], np.cumsum(keep) - 1
-    columns = {
-        name: getattr(intensities, name)[rows]
-        for name in ("point", "source", "counts", "sigma", "flag", "used")
-    }
-    if intensities.sky is not None:
-        columns["sky"] = intensities.sky[rows]
-    table = TableIntensities(
-        int(keep.sum()), intensities.points, exposure=place[intensities.exposure[rows]], **columns
-    )
+    names = ("point", "source", "counts", "sigma", "flag", "used", *["sky"] * (intensities.sky is not None))
+    columns = {name: getattr(intensities, name)[rows] for name in names}
+    columns["exposure"] = place[intensities.exposure[rows]]
+    table = TableIntensities(int(keep.sum()), intensities.points, **columns)
     return dataclasses.replace(calset, exposures=calset.exposures[keep], intensities=table)
 
 
@@ -171,11 +160,8 @@ class EffectAmplitude(Parameter):
     def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
         """That of a leaf of a probe; `group` is None where the effect has a single one."""
         of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
-        fields: dict[str, Any] = vars(leaf) | {
-            "name": f"{effect}{of_group}.{leaf.name}{of_member}",
-            "part": effect,
-            "start": 0.0,
-        }
+        name = f"{effect}{of_group}.{leaf.name}{of_member}"
+        fields: dict[str, Any] = vars(leaf) | {"name": name, "part": effect, "start": 0.0}
         return cls(**fields, shape=(group or 0, member), in_model=f"{effect}.{leaf.name}")
 
     @classmethod
@@ -223,9 +209,8 @@ def with_candidates(
     changes = [change for _, change in candidates.values()]
     held = [k for k, change in enumerate(changes) if not change]
     instrument = model.instrument(values)
-    select = np.hstack(
-        [model.selection(), np.eye(len(model.names))[:, [model.index(list(candidates)[k]) for k in held]]]
-    )
+    at = [model.index(list(candidates)[k]) for k in held]
+    select = np.hstack([model.selection(), np.eye(len(model.names))[:, at]])
     residuals, slopes = [], []
     for batch in likelihood.points:
         residual, slope = engine.linearised_residuals(instrument, likelihood.plan, batch)
@@ -249,11 +234,8 @@ def with_candidates(
 def model_hash(model: Model) -> str:
     """Of all that nights must have in common: instrument, physics, effects, ties and values that are held."""
     header = header_of(model)
-    held = [
-        f"{p.name} {p.tie or repr(p.start)}"
-        for p in model.parameters
-        if (p.tie or not p.free) and p.part not in SKY_AND_STARS
-    ]
+    fixed = (p for p in model.parameters if (p.tie or not p.free) and p.part not in SKY_AND_STARS)
+    held = [f"{p.name} {p.tie or repr(p.start)}" for p in fixed]
     text = "\n".join([repr(header), model.template.description, *held])
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -295,11 +277,13 @@ def night_equations(
             chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
             census = likelihood.census
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
-            raise DataError(
-                f"{source}, night of MJD {evening}: the model has no finite counts or derivatives where the nights "
-                "meet; some night is far from it: fit each by itself (walop-jax refit), leave out those not trusted"
+            what = "the model has no finite counts or derivatives where the nights meet"
+            advice = (
+                "some night is far from it: fit each by itself (walop-jax refit), leave out those not trusted"
             )
+            raise fail(f"{source}, night of MJD {evening}: {what}", advice=advice)
         e = subset.exposures
+        at_zero = [0.0 if change else point[model.index(name)] for name, (_, change) in beyond.items()]
         nights.append(
             Night(
                 instrument=model.name,
@@ -316,12 +300,7 @@ def night_equations(
                 chi2=chi2,
                 parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in beyond.values())),
                 candidates=len(beyond),
-                reference=np.concatenate(
-                    [
-                        point[model.free],
-                        [0.0 if change else point[model.index(name)] for name, (_, change) in beyond.items()],
-                    ]
-                ),
+                reference=np.append(point[model.free], at_zero),
                 gradient=gradient,
                 matrix=matrix,
             )
@@ -375,12 +354,9 @@ def data_hash(calset: CalibrationSet) -> str:
 
 def _bytes(record: object) -> bytes:
     """The content of a dataclass of arrays, texts and numbers."""
-    values = (getattr(record, field.name) for field in dataclasses.fields(record))  # type: ignore[arg-type]
-    arrays = (np.asarray(value) for value in values)
-    return b"".join(
-        array.tobytes() if array.dtype.kind not in "OUS" else repr(array.tolist()).encode()
-        for array in arrays
-    )
+    arrays = (np.asarray(getattr(record, field.name)) for field in dataclasses.fields(record))  # type: ignore[arg-type]
+    parts = (a.tobytes() if a.dtype.kind not in "OUS" else repr(a.tolist()).encode() for a in arrays)
+    return b"".join(parts)
 
 
 # -------------------------------------------------------------------------------------------------------- together
@@ -448,9 +424,7 @@ def together(nights: Sequence[Night]) -> Together:
             cut = len(night.parameters) - night.candidates
             for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
                 union.setdefault(p.name, p)
-    of_model = {
-        p.name for night in ordered for p in night.parameters[: len(night.parameters) - night.candidates]
-    }
+    of_model = {p.name for night in ordered for p in night.parameters[: len(night.names) - night.candidates]}
     names, n = list(union), len(union)
     place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
     gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
@@ -475,10 +449,8 @@ def together(nights: Sequence[Night]) -> Together:
     gradient *= scale
     matrix *= scale
     matrix *= scale[:, None]
-    number, file = (
-        np.unique(keys, return_inverse=True)[1].astype(int)
-        for keys in ([night.number for night in ordered], [night.sha256 for night in ordered])
-    )
+    keys = [night.number for night in ordered], [night.sha256 for night in ordered]
+    number, file = (np.unique(key, return_inverse=True)[1].astype(int) for key in keys)
     mjd = np.array([night.mjd for night in ordered])
     equations = Equations(mjd, number, file, chi2, gradient, matrix, scale)
     return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
@@ -490,11 +462,8 @@ _ONE_STAR = "correct one of them, or give it another NAME"
 def check_together(nights: Sequence[Night]) -> None:
     """Raise `DataError` for nights of other instruments or models, and for data that are there twice."""
     first = nights[0]
-    advice = {
-        "instrument": "stack the instruments apart",
-        "model": "linearise all nights with one model (like=)",
-    }
-    for name, remedy in advice.items():
+    remedies = "stack the instruments apart", "linearise all nights with one model (like=)"
+    for name, remedy in zip(("instrument", "model"), remedies, strict=True):
         for night in nights:
             if getattr(night, name) != getattr(first, name):
                 mine, theirs = (f"{getattr(entry, name)[:12]} ({entry.source})" for entry in (first, night))

@@ -32,15 +32,8 @@ from walop_jax.io.code import files_of_users, run_file
 from walop_jax.io.errors import DataError, fail
 from walop_jax.model.compiled import switch_on
 from walop_jax.model.specification import Model
-from walop_jax.nights.equations import (
-    Candidates,
-    Night,
-    candidates_of,
-    model_hash,
-    night_equations,
-    source_of,
-    with_candidates_of,
-)
+from walop_jax.nights import equations
+from walop_jax.nights.equations import Candidates, Night
 from walop_jax.nights.night_file import read_nights, write_nights
 from walop_jax.posterior.run import Run
 
@@ -102,13 +95,12 @@ class Maker:
 
     def _first(self, data: Data) -> Made:
         if self.like is None:
-            raise fail(
-                f"{source_of(data.read())} is a set, and there are no values at which to linearise it",
-                advice="give --like RUN, a fit of the same model (like= in Python)",
-            )
+            what = "is a set, and there are no values at which to linearise it"
+            advice = "give --like RUN, a fit of the same model (like= in Python)"
+            raise fail(f"{equations.source_of(data.read())} {what}", advice=advice)
         place = None
         if self.folder is not None:
-            named = f"{data.sha256} {model_hash(data.model or self.like.model)}"
+            named = f"{data.sha256} {equations.model_hash(data.model or self.like.model)}"
             place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
             if place.exists():
                 return Made(read_nights(place))
@@ -118,13 +110,13 @@ class Maker:
         table = calset.intensities
         measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
         try:
-            nights = night_equations(calset, model, values, candidates, own=True, sets=self.count)
+            nights = equations.night_equations(calset, model, values, candidates, own=True, sets=self.count)
         except DataError as error:
-            return Made([], source_of(calset), measured, error)
+            return Made([], equations.source_of(calset), measured, error)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, nights, overwrite=True)
-        return Made(nights, source_of(calset), measured)
+        return Made(nights, equations.source_of(calset), measured)
 
     def _again(self, night: Night, task: Task) -> Made:
         """The night linearised at other values, with some candidates; the others follow (`with_candidates_of`)."""
@@ -137,8 +129,10 @@ class Maker:
         held = zip(night.names[cut:], night.reference[cut:].tolist(), strict=True)
         # A gauge stays where its column was made.
         values = dict(task.values) | {name: value for name, value in held if name not in candidates}
-        (anew,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
-        return Made([with_candidates_of(anew, night)])
+        (anew,) = equations.night_equations(
+            calset, model, values, candidates, number=night.number, sets=self.count
+        )
+        return Made([equations.with_candidates_of(anew, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None
@@ -154,7 +148,7 @@ class Maker:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self._candidates:
-            self._candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+            self._candidates[key] = equations.candidates_of(model, calset.exposures, model.catalogue)
         return self._candidates[key]
 
 
@@ -187,10 +181,9 @@ class Makers:
     def _refuse_copies(self, here: str, smallest: frozenset[int]) -> None:
         shared = Counter(self._seen[number] for number in smallest if number in self._seen)
         if shared and (closest := shared.most_common(1)[0])[1] > COPIED * len(smallest):
-            share = (
-                f"{100 * closest[1] / len(smallest):.0f} % of its measurements are in {closest[0]} as well"
-            )
-            raise fail(share, file=here, advice="leave one out: repeated data would shrink the errors")
+            share = f"{100 * closest[1] / len(smallest):.0f} %"
+            what = f"{share} of its measurements are in {closest[0]} as well"
+            raise fail(what, file=here, advice="leave one out: repeated data would shrink the errors")
         self._seen |= dict.fromkeys(smallest, here)
 
 
@@ -215,9 +208,8 @@ def mapped(
     if not tasks:
         return ()
     start = os.getpid(), files_of_users()
-    return executor.map(
-        _there, *zip(*((start, pickle.dumps((function, task))) for task in tasks), strict=True)
-    )
+    work = [pickle.dumps((function, task)) for task in tasks]
+    return executor.map(_there, [start] * len(work), work)
 
 
 def _there(start: tuple[int, tuple[str, ...]], work: bytes) -> Any:
@@ -264,9 +256,8 @@ def executor_of(
         try:
             client = hold.enter_context(dask.Client(address, timeout="20s"))
         except OSError as error:
-            raise fail(
-                f"no Dask scheduler answers at {scheduler}: {error}", advice="start dask scheduler"
-            ) from None
+            what = f"no Dask scheduler answers at {scheduler}: {error}"
+            raise fail(what, advice="start dask scheduler") from None
         yield hold.enter_context(client.get_executor(pure=False, retries=3))
 
 

@@ -26,22 +26,19 @@ from walop_jax.nights.equations import EffectAmplitude, Night
 NIGHTVER = 1
 _NAN = float("nan")
 _AGAIN = "make the nights again and write them anew"
+_OF_PARAMETERS = ("START", "PRIOR_MEAN", "PRIOR_WIDTH", "LOOSE", "SCALE")
 _PARAMETERS = {
-    "NAME": Column("str"),
-    "UNIT": Column("str"),
-    **{
-        name: Column("float", missing=_NAN)
-        for name in ("START", "PRIOR_MEAN", "PRIOR_WIDTH", "LOOSE", "SCALE")
-    },
+    **dict.fromkeys(("NAME", "UNIT"), Column("str")),
+    **dict.fromkeys(_OF_PARAMETERS, Column("float", missing=_NAN)),
     "CANDIDATE": Column("bool"),
 }
 _NIGHTS = {
     "NIGHT": Column("int"),
-    **{name: Column("float", "d") for name in ("MJD_BEG", "MJD_END", "MJD")},
-    **{name: Column("str") for name in ("FILTERS", "SOURCE", "SHA256")},
-    **{name: Column("int") for name in ("NDATA", "DOF")},
+    **dict.fromkeys(("MJD_BEG", "MJD_END", "MJD"), Column("float", "d")),
+    **dict.fromkeys(("FILTERS", "SOURCE", "SHA256"), Column("str")),
+    **dict.fromkeys(("NDATA", "DOF"), Column("int")),
     "CHI2": Column("float"),
-    **{name: Column("float", width=None) for name in ("REFERENCE", "GRADIENT", "MATRIX")},
+    **dict.fromkeys(("REFERENCE", "GRADIENT", "MATRIX"), Column("float", width=None)),
 }
 
 
@@ -88,14 +85,10 @@ def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overw
     rows["FILTERS"] = _texts(" ".join(night.filters) for night in nights)
     rows["MATRIX"] = np.stack([night.matrix[lower] for night in nights])
     primary = fits.PrimaryHDU()
-    primary.header.update(
-        NIGHTVER=NIGHTVER, INSTRUME=first.instrument, CREATOR="walop-jax", MODEL=first.model
-    )
-    hdus = [
-        primary,
-        table_hdu("PARAMETERS", parameters, path, _PARAMETERS),
-        table_hdu("NIGHTS", rows, path, _NIGHTS),
-    ]
+    cards = {"INSTRUME": first.instrument, "CREATOR": "walop-jax", "MODEL": first.model}
+    primary.header.update(NIGHTVER=NIGHTVER, **cards)
+    tables = ("PARAMETERS", parameters, _PARAMETERS), ("NIGHTS", rows, _NIGHTS)
+    hdus = [primary, *(table_hdu(name, columns, path, rules) for name, columns, rules in tables)]
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(hdus, temporary)
 
@@ -126,32 +119,25 @@ def _nights(opened: OpenFile) -> list[Night]:
     n = len(table["NAME"])
     for name, width in (("REFERENCE", n), ("GRADIENT", n), ("MATRIX", n * (n + 1) // 2)):
         if rows[name].shape[1] != width or not np.isfinite(rows[name]).all():
-            raise fail(
-                f"is not {width} finite numbers a row",
-                file=path,
-                extension="NIGHTS",
-                column=name,
-                advice=_AGAIN,
-            )
-    priors = np.stack([table["PRIOR_MEAN"], table["PRIOR_WIDTH"]], axis=1).tolist()
-    parameters = tuple(
-        Parameter(
-            name=str(table["NAME"][k]),
-            unit=str(table["UNIT"][k]),
-            about="",
-            source="",
-            start=float(table["START"][k]),
-            prior=None if np.isnan(priors[k][1]) else (priors[k][0], priors[k][1]),
-            scale=float(table["SCALE"][k]),
-            loose=None if np.isnan(table["LOOSE"][k]) else float(table["LOOSE"][k]),
-            part=str(table["NAME"][k]).partition(".")[0],
-        )
-        for k in range(n)
-    )
-    parameters = tuple(
-        EffectAmplitude.read(p) if beyond and p.start == 0.0 else p  # others are gauges of the model
-        for p, beyond in zip(parameters, table["CANDIDATE"], strict=True)
-    )
+            what = f"is not {width} finite numbers a row"
+            raise fail(what, file=path, extension="NIGHTS", column=name, advice=_AGAIN)
+    numbers, parameters = (table[name].tolist() for name in _OF_PARAMETERS), []
+    entries = zip(table["NAME"], table["UNIT"], *numbers, table["CANDIDATE"], strict=True)
+    for name, unit, start, mean, width, loose, scale, candidate in entries:
+        texts = {
+            "name": str(name),
+            "unit": str(unit),
+            "about": "",
+            "source": "",
+            "part": str(name).partition(".")[0],
+        }
+        limits = {
+            "prior": None if np.isnan(width) else (mean, width),
+            "loose": None if np.isnan(loose) else loose,
+        }
+        p = Parameter(**texts, start=start, scale=scale, **limits)
+        # Candidates that start elsewhere are gauges of the model.
+        parameters.append(EffectAmplitude.read(p) if candidate and start == 0.0 else p)
     lower, nights = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):
         matrix = np.zeros((n, n))
@@ -162,7 +148,7 @@ def _nights(opened: OpenFile) -> list[Night]:
                 instrument=str(header.get("INSTRUME", "")),
                 model=str(header.get("MODEL", "")),
                 filters=tuple(str(rows["FILTERS"][k]).split()),
-                parameters=parameters,
+                parameters=tuple(parameters),
                 candidates=int(table["CANDIDATE"].sum()),
                 matrix=matrix,
                 **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},

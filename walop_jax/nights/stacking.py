@@ -45,6 +45,10 @@ from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
 from walop_jax.posterior.run import Run
 
+Laws = Sequence[Law | None]
+AtHand = Mapping[tuple[str, int], Data]
+OfUnits = Float[np.ndarray, "u n"]
+
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
 
@@ -52,10 +56,8 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
-FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)
-"""The files of a survey."""
-PARTIAL = "partial"
-"""Folder of the nights that are made, until all are."""
+FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)  # the files of a survey
+PARTIAL = "partial"  # folder of the nights that are made, until all are
 
 
 class _Opened(NamedTuple):
@@ -143,13 +145,11 @@ def stack(
         what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
     if fixed := sum(night.key not in at_hand for night in data.nights):
-        what = (
-            f"{fixed} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
-        )
+        what = f"{fixed} of {len(data.nights)} nights stay as they were linearised"
+        what += ": their data are not at hand"
         doubts.append(Doubt(Quality(0), what, blocking=False))
-    happened = {event for source in opened for event in source.events} | set(
-        () if events is None else events_of(events)
-    )
+    happened = {event for source in opened for event in source.events}
+    happened |= set(() if events is None else events_of(events))
     breaks = sorted((at_solution(data, solution, entry) for entry in breaks), key=lambda entry: entry.night)
     return Survey(data, chosen, solution, maker.like, tuple(doubts), tuple(breaks), tuple(sorted(happened)))
 
@@ -159,9 +159,8 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     read = read_input_table(table, ("MJD",)) if isinstance(table, str | os.PathLike) else in_memory(table)
     mjd = numeric_column(read, "MJD", Column("float", "d"))
     if "WHAT" not in read.names:
-        raise fail(
-            "the column is missing", file=read.path, column="WHAT", advice="describe the event in words"
-        )
+        advice = "describe the event in words"
+        raise fail("the column is missing", file=read.path, column="WHAT", advice=advice)
     words = read.table.columns[read.names.index("WHAT")]
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
@@ -228,12 +227,9 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
         folder = RunFolder(path)
         document = folder.document(SURVEY) if SURVEY in folder else {"breaks": [], "events": []}
-        return _Opened(
-            nights_in(path),
-            fit=fit,
-            breaks=tuple(Break.read(entry) for entry in document["breaks"]),
-            events=tuple((float(entry["mjd"]), str(entry["what"])) for entry in document["events"]),
-        )
+        breaks = tuple(Break.read(entry) for entry in document["breaks"])
+        events = tuple((float(entry["mjd"]), str(entry["what"])) for entry in document["events"])
+        return _Opened(nights_in(path), None, fit, breaks, events)
     keywords = () if path.is_dir() else primary_keywords(path)
     if "NIGHTVER" in keywords:
         return _Opened(read_nights(path))
@@ -244,9 +240,7 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
         return _Opened([], Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest()))
 
 
-def _settled(
-    data: Together, laws: Sequence[Law | None], at_hand: Mapping[tuple[str, int], Data], makers: Makers
-) -> tuple[Together, Solution, bool]:
+def _settled(data: Together, laws: Laws, at_hand: AtHand, makers: Makers) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
     A missing effect may lead ever farther away: the search ends where all nights come no closer.
@@ -264,12 +258,7 @@ def _settled(
     return data, solution, False
 
 
-def _distances(
-    data: Together,
-    solution: Solution,
-    references: Float[np.ndarray, "u n"],
-    at_hand: Mapping[tuple[str, int], Data],
-) -> dict[int, float]:
+def _distances(data: Together, solution: Solution, references: OfUnits, at_hand: AtHand) -> dict[int, float]:
     """Distances (standard errors) of nights whose data are at hand, from references to a solution, largest first."""
     values, sigma = _in_units(data, solution)
     # Candidates have no place in the model: their part stays first-order, at 0.
@@ -281,9 +270,9 @@ def _distances(
 def _linearised(
     data: Together,
     solution: Solution,
-    laws: Sequence[Law | None],
+    laws: Laws,
     again: Collection[int],
-    at_hand: Mapping[tuple[str, int], Data],
+    at_hand: AtHand,
     makers: Makers,
     candidates: frozenset[str] = frozenset(),
 ) -> tuple[Together, Solution, list[int], bool]:
@@ -319,9 +308,7 @@ def _linearised(
     return data, solution, anew, enough
 
 
-def _in_units(
-    data: Together, solution: Solution
-) -> tuple[Float[np.ndarray, "u n"], Float[np.ndarray, "u n"]]:
+def _in_units(data: Together, solution: Solution) -> tuple[OfUnits, OfUnits]:
     """Values and errors (night, parameter) of a solution."""
     scale = data.equations.scale
     return data.origin + solution.values * scale, np.maximum(solution.errors() * scale, 1e-12 * scale)
@@ -346,10 +333,8 @@ def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
         verdict = fit.verdict if isinstance(fit, Calibration) else fit.checked_verdict()
         where = str(fit.path or source_of(fit)) if isinstance(fit, Calibration) else source_of(fit.calset)
         if (fit.errors_from if isinstance(fit, FitResult) else verdict.errors_from) != STATED:
-            raise fail(
-                f"the errors of {where} do not explain its scatter, and nights are weighed by them",
-                advice="correct N_ERR, or leave the night out",
-            )
+            what = f"the errors of {where} do not explain its scatter, and nights are weighed by them"
+            raise fail(what, advice="correct N_ERR, or leave the night out")
         if not verdict.trusted:
             doubts.append(Doubt(verdict.quality, f"the fit of {where} is not trusted"))
     return doubts
@@ -358,14 +343,11 @@ def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
 def _undetermined(data: Together, error: UndeterminedError) -> DataError:
     name = data.names[error.parameter]
     if error.unit is None:
-        return fail(
-            f"the nights do not determine {name} under its law", advice="give it a prior, or another law"
-        )
-    number = data.nights[error.unit].number
-    return fail(
-        f"the night of MJD {number} has no information on {name}, which has a value of its own there",
-        advice="give its law a spread, or let it be shared",
-    )
+        what = f"the nights do not determine {name} under its law"
+        return fail(what, advice="give it a prior, or another law")
+    what = f"has no information on {name}, which has a value of its own there"
+    night = f"the night of MJD {data.nights[error.unit].number}"
+    return fail(f"{night} {what}", advice="give its law a spread, or let it be shared")
 
 
 def _about_time(nights: Sequence[Night]) -> list[Doubt]:
@@ -378,13 +360,10 @@ def _about_time(nights: Sequence[Night]) -> list[Doubt]:
     return doubts
 
 
-def _check_filters(data: Together, laws: Sequence[Law | None]) -> None:
+def _check_filters(data: Together, laws: Laws) -> None:
     first = data.nights[0]
-    free = {
-        law.base
-        for law, p in zip(laws, data.parameters, strict=True)
-        if law and p.name.startswith("throughput.")
-    }
+    pairs = zip(laws, data.parameters, strict=True)
+    free = {law.base for law, p in pairs if law and p.name.startswith("throughput.")}
     for night in data.nights[1:]:
         if not set(night.filters) & set(first.filters) and not free & {"night", "file"}:
             raise fail(

@@ -39,6 +39,7 @@ from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, rea
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
+OfMatrix = tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float]
 
 HALF_A_DAY = 0.5
 SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own standard deviations
@@ -48,10 +49,9 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 class Survey(Drawn):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is
-    a calibration of the same model, from which field, filters, site and parameters that are held are taken (None:
-    there is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of
-    users (MJD, words).
+    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is a
+    calibration of the same model, from which field, filters, site and parameters that are held are taken (None: there
+    is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of users (MJD, words).
     """
 
     first_figure = "tracks"
@@ -90,9 +90,8 @@ class Survey(Drawn):
             else:
                 chi2 -= entry.precision * (value - entry.mean) ** 2
                 weak += entry.precision * variance
-        for cell, local, (spread, *_) in zip(
-            system.cells, self.solution.local, self.solution.smoothed, strict=True
-        ):
+        of_cells = zip(system.cells, self.solution.local, self.solution.smoothed, strict=True)
+        for cell, local, (spread, *_) in of_cells:
             states = cell.parameter[np.isfinite(cell.mjd)].tolist()
             stated = prior[cell.parameter] | np.isfinite(system.spread[cell.parameter])
             # A step of a walk is known beforehand to be about 0: one for every state but the first.
@@ -102,9 +101,8 @@ class Survey(Drawn):
             weak += float(loose @ np.diag(spread))
             walks |= set(states)
         unknown = len(system.globals) + sum(len(cell.parameter) for cell in system.cells)
-        return float(chi2), int(
-            sum(night.dof for night in self.data.nights) + constraints - unknown + round(weak)
-        )
+        data = sum(night.dof for night in self.data.nights)
+        return float(chi2), int(data + constraints - unknown + round(weak))
 
     @functools.cached_property
     def verdict(self) -> Verdict:
@@ -156,11 +154,7 @@ class Survey(Drawn):
         return reached(p_errors(matrix, covariance))
 
     @functools.cached_property
-    def _matrix(
-        self,
-    ) -> (
-        tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float] | None
-    ):
+    def _matrix(self) -> OfMatrix | None:
         """Matrix, derivatives and covariance of structure where one exposure measures u; the share where it does not.
 
         None where p is not measured.
@@ -224,10 +218,8 @@ class Survey(Drawn):
         value, covariance = self.data.origin + value * scale, covariance * np.outer(scale, scale)
         for case in self.breaks:
             if case.kind == "step" and case.before < mjd < case.after:
-                i, share = (
-                    self.data.names.index(case.name),
-                    (mjd - case.before) / (case.after - case.before),
-                )
+                i = self.data.names.index(case.name)
+                share = (mjd - case.before) / (case.after - case.before)
                 value[i] += case.size * (share - (mjd >= case.date))
                 covariance[i, i] += (case.size**2 + case.error**2) * share * (1.0 - share)
         return value, covariance
@@ -241,13 +233,11 @@ class Survey(Drawn):
         if not start <= mjd < stop:
             what = f"MJD {mjd:.3f} is outside the validity of the survey, {start:.3f} to {stop:.3f}"
             if not force:
-                raise fail(
-                    what, advice="calibrate a night nearer to it, or give --force (force=True in Python)"
-                )
+                advice = "calibrate a night nearer to it, or give --force (force=True in Python)"
+                raise fail(what, advice=advice)
             against = (*against, Doubt(Quality.VALIDITY_FORCED, what, blocking=False))
-        return dataclasses.replace(
-            self._product(mjd), verdict=dataclasses.replace(self.verdict, against=against)
-        )
+        verdict = dataclasses.replace(self.verdict, against=against)
+        return dataclasses.replace(self._product(mjd), verdict=verdict)
 
     def _product(self, mjd: float) -> Calibration:
         """The calibration of a moment, whether it is valid or not."""
@@ -281,10 +271,8 @@ class Survey(Drawn):
         for p in candidates:
             part, (group, member) = p.part, (shape := p.shape)
             if shapes.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
-                raise fail(
-                    f"{p.name} is one shape of its effect, and the model has another",
-                    advice="put the effect into the model file and fit the nights again",
-                )
+                what = f"{p.name} is one shape of its effect, and the model has another"
+                raise fail(what, advice="put the effect into the model file and fit the nights again")
             kind: EffectKind = next(entry for entry in model.catalogue if entry.name == part)
             if part not in model.effect_names:
                 model = with_effects(model, [kind.probes(context)[group][member]], context)
@@ -333,14 +321,15 @@ class Survey(Drawn):
 
     def to_table(self) -> Any:
         """The nights as an astropy table: time, χ², its expectation, and the distance."""
-        nights = self.data.nights
+        names = ("number", "mjd", "dof", "source")
+        night, mjd, dof, source = (np.array([getattr(n, name) for n in self.data.nights]) for name in names)
         return astropy_table({
-            "NIGHT": (np.array([n.number for n in nights]), "", "MJD of the evening"),
-            "MJD": (np.array([n.mjd for n in nights]), "d", "mean of the exposures, UTC"),
+            "NIGHT": (night, "", "MJD of the evening"),
+            "MJD": (mjd, "d", "mean of the exposures, UTC"),
             "CHI2": (self.solution.unit_chi2, "", "of the data, under the laws"),
-            "DOF": (np.array([n.dof for n in nights]), "", "data less fluxes"),
+            "DOF": (dof, "", "data less fluxes"),
             "EXCESS": (self.excess, "", "(CHI2 - DOF)/sqrt(2 DOF)"),
-            "SOURCE": (np.array([n.source for n in nights]), "", "files"),
+            "SOURCE": (source, "", "files"),
         })  # fmt: skip
 
     def document(self) -> dict[str, Any]:
@@ -373,20 +362,19 @@ class Survey(Drawn):
     @property
     def advice(self) -> tuple[str, ...]:
         """Advice, in sentences, the most urgent first."""
-        sentences = (
-            [] if self.trusted else ["Look at the nights that scatter too much: walop-jax diagnose NIGHT."]
-        )
+        first = "Look at the nights that scatter too much: walop-jax diagnose NIGHT."
+        sentences = [] if self.trusted else [first]
         for case in self.breaks:
             if case.alike:
                 needed = (
-                    "no more nights like these would separate them" if math.isinf(case.nights_needed)
-                    else f"{'or ' if case.separated_by else ''}{case.nights_needed:.0f} more nights like these"
-                )  # fmt: skip
+                    f"{'or ' if case.separated_by else ''}{case.nights_needed:.0f} more nights like these"
+                )
+                if math.isinf(case.nights_needed):
+                    needed = "no more nights like these would separate them"
                 names = ", ".join(case.alike[:3]) + (" …" if len(case.alike) > 3 else "")
                 how = "; ".join((*case.separated_by, needed))
-                sentences.append(
-                    f"MJD {case.night}: {case.name} cannot be separated from {names}. To separate them: {how}."
-                )
+                what = f"{case.name} cannot be separated from {names}"
+                sentences.append(f"MJD {case.night}: {what}. To separate them: {how}.")
         return (*sentences, f"Calibrate again before MJD {self.until:.1f}.")
 
     def display(self) -> Display:
@@ -402,18 +390,11 @@ class Survey(Drawn):
             facts["p of a star"] = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
         if not self.breaks:
             facts["changes"] = "none found beyond the laws"
-        rows = tuple(
-            (
-                case.kind, case.name, " ± ".join(value_and_error(case.size, case.error)), case.unit,
-                str(case.night),
-                f"{case.z:+.1f}", ", ".join(case.alike[:3]),
-            )
-            for case in self.breaks
-        )  # fmt: skip
-        return Display(
-            f"Survey of {nights[0].instrument}: {verdict.words}",
-            tuple(facts.items()),
-            ("change", "of", ">size", "unit", ">first night", ">z", "or as well"),
-            rows,
-            tuple(dict.fromkeys((*verdict.warnings, *self.advice))),
-        )
+        rows = []
+        for case in self.breaks:
+            size, alike = " ± ".join(value_and_error(case.size, case.error)), ", ".join(case.alike[:3])
+            rows.append((case.kind, case.name, size, case.unit, str(case.night), f"{case.z:+.1f}", alike))
+        title = f"Survey of {nights[0].instrument}: {verdict.words}"
+        head = ("change", "of", ">size", "unit", ">first night", ">z", "or as well")
+        notes = tuple(dict.fromkeys((*verdict.warnings, *self.advice)))
+        return Display(title, tuple(facts.items()), head, tuple(rows), notes)

@@ -29,32 +29,11 @@ from walop_jax.data.settings import DEFAULT_FILTER, Settings
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import two_digits
-from walop_jax.paper.polynomial import (
-    PaperCalibration,
-    fit_paper,
-    fit_polynomials,
-    full_moon_scheme,
-    judge_patches,
-    measured_qu,
-    polariser_exposures,
-    polariser_states,
-    polynomial_terms,
-    with_test_stars,
-)
+from walop_jax.paper import polynomial
+from walop_jax.paper.polynomial import PaperCalibration, fit_polynomials, measured_qu
 from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
-from walop_jax.science.star_errors import (
-    QUANTITIES,
-    MethodErrors,
-    Truth,
-    Vectors,
-    determinant,
-    joint_errors,
-    promised_errors,
-    star_errors,
-    statistics,
-    transmitted,
-    truth_vectors,
-)
+from walop_jax.science import star_errors
+from walop_jax.science.star_errors import MethodErrors, Truth, Vectors, determinant, statistics, transmitted
 
 LINES = 81  # wavelengths across the filter
 
@@ -107,13 +86,13 @@ def offsets(
     centre = measured_qu(reference[..., 0])  # (q_m, u_m) of unpolarised light
     light = np.concatenate([states, np.zeros((1, 2)), stars])
     exact, _ = fit_polynomials(measured_qu(transmitted(reference, light)), light)
-    design = polynomial_terms(measured)
+    design = polynomial.polynomial_terms(measured)
     scale = np.linalg.norm(design, axis=1)
     directions = np.linalg.svd(design / scale[:, None], full_matrices=False)[2]
     departure = (paper.coefficients - exact) * scale[:, None]
 
     def along(count: int) -> Float[np.ndarray, "p 2"]:
-        weak, terms = directions[:, -count:], polynomial_terms(centre) / scale
+        weak, terms = directions[:, -count:], polynomial.polynomial_terms(centre) / scale
         return np.einsum("pct,pnt,pnv,pv->pc", departure, weak, weak, terms, optimize=True)
 
     smooth, _ = fit_polynomials(measured_qu(transmitted(reference, states)), states)
@@ -122,7 +101,9 @@ def offsets(
     )
 
     def delta(coefficients: Float[np.ndarray, "p 2 5"]) -> Float[np.ndarray, "p 2"]:
-        return with_test_stars(paper.x, paper.y, coefficients, paper.condition, reference, stars).delta
+        return polynomial.with_test_stars(
+            paper.x, paper.y, coefficients, paper.condition, reference, stars
+        ).delta
 
     found, noiseless, with_one = (delta(values) for values in (paper.coefficients, smooth, anchored))
     return Offsets(found, along(1), along(3), noiseless, with_one, paper.condition)
@@ -176,27 +157,17 @@ class Comparison(Drawn):
         """Errors of q, u and p by both methods, on the grid points and between them."""
         rows = []
         for where, errors in (("on the grid", self.grid.document()), ("between", self.between.document())):
-            for quantity in QUANTITIES:
+            for quantity in star_errors.QUANTITIES:
                 for method, name in (("paper", "Paper II"), ("joint", "joint model")):
                     s = errors[method]["all"][quantity]
                     sizes = (two_digits(s[key]) for key in ("median", "rms", "p95", "max"))
                     rows.append((where, quantity, name, *sizes, f"{100 * s['share_below_goal']:.1f} %"))
-        source = "truth" if self.truth else "covariance"
-        return Display(
-            title="Errors of stars over the field, Paper II beside the joint model",
-            facts=(
-                ("stars", f"p ≤ {100 * LARGEST_P:.0f} %, through {self.filter}"),
-                ("joint model", f"errors from the {source}"),
-            ),
-            head=(
-                "where",
-                "of",
-                "method",
-                *(f">{s} (%)" for s in ("median", "rms", "95 %", "max")),
-                ">below 0.1 %",
-            ),
-            rows=tuple(rows),
-        )
+        source = f"errors from the {'truth' if self.truth else 'covariance'}"
+        stars = f"p ≤ {100 * LARGEST_P:.0f} %, through {self.filter}"
+        sizes = (f">{s} (%)" for s in ("median", "rms", "95 %", "max"))
+        title = "Errors of stars over the field, Paper II beside the joint model"
+        head = ("where", "of", "method", *sizes, ">below 0.1 %")
+        return Display(title, (("stars", stars), ("joint model", source)), head, tuple(rows))
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
         """One row per point, the grid first: position, errors of both methods, the values of the paper."""
@@ -211,7 +182,7 @@ class Comparison(Drawn):
             "GRID": (np.arange(len(both("x"))) < len(self.grid.x), "a point with a polynomial of its own"),
             "ZONE": (both("zone"), "one exposure carries almost no information on u"),
         }
-        for k, quantity in enumerate(QUANTITIES):
+        for k, quantity in enumerate(star_errors.QUANTITIES):
             for method in ("paper", "joint"):
                 about = f"rms error of {quantity}, {method}"
                 columns[f"{quantity}_{method}".upper()] = both(method)[:, k], about
@@ -240,8 +211,8 @@ def compare(
     between the grid points. Raises `DataError` and ValueError as `fit_paper` and `PaperCalibration.between`.
     """
     stars = sample_stars(seed=seed)
-    paper = fit_paper(calset, filter_name, stars)
-    exposures = polariser_exposures(calset, filter_name)
+    paper = polynomial.fit_paper(calset, filter_name, stars)
+    exposures = polynomial.polariser_exposures(calset, filter_name)
     teff = float(np.median(calset.exposures.teff[exposures]))
     analysis, setting = AnalysisVectors(calibration), Settings.default(1, filter_name)
 
@@ -253,11 +224,11 @@ def compare(
     ) -> MethodErrors:
         joint = vectors(x, y)
         reference = joint if true is None else true
-        of_paper = star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
+        of_paper = star_errors.star_errors(local.recover(measured_qu(transmitted(reference, stars))), stars)
         if true is None:
-            of_joint = promised_errors(analysis, setting, x, y, stars)
+            of_joint = star_errors.promised_errors(analysis, setting, x, y, stars)
         else:
-            of_joint = joint_errors(joint, reference, stars)
+            of_joint = star_errors.joint_errors(joint, reference, stars)
         return MethodErrors(x, y, of_paper, of_joint, np.abs(determinant(reference)) < SMALLEST_DETERMINANT)
 
     if truth is None:
@@ -265,12 +236,12 @@ def compare(
         x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
     else:
         x, y = truth.x, truth.y
-        true = truth_vectors(vectors(x, y), truth.matrix)
+        true = star_errors.truth_vectors(vectors(x, y), truth.matrix)
     on_grid = vectors(paper.x, paper.y)
     block = calset.intensities.block(0, len(calset.points))
     complete = block.used[:, exposures].all(axis=1)
     measured = measured_qu(block.counts[complete][:, exposures])
-    states = polariser_states(calset.exposures.clp_angle[exposures])
+    states = polynomial.polariser_states(calset.exposures.clp_angle[exposures])
     curve = calibration.filter_curve(filter_name)
     lit = curve.wavelength[curve.throughput > 0.05 * curve.throughput.max()]
     wavelength = np.linspace(lit[0], lit[-1], LINES)
@@ -301,17 +272,17 @@ def _moon(
     e = calset.exposures
     if not np.any(e.direct("moon")):
         return None
-    patches = judge_patches(calset, calibration)
+    patches = polynomial.judge_patches(calset, calibration)
     document = patches.document(e.exposure)
     weight = patches.weight[~e.position(CALIBRATION_PLATE).inside[patches.exposure]]
     try:
-        schemes = {
-            "equal_weights": full_moon_scheme(calset, paper),
-            "down_weighted": full_moon_scheme(calset, paper, weight),
-        }
+        of_weights = {"equal_weights": None, "down_weighted": weight}
+        schemes = {name: polynomial.full_moon_scheme(calset, paper, w) for name, w in of_weights.items()}
     except (DataError, ValueError) as error:
         return document | {"scheme": None, "why_not": str(error)}
     measured = measured_qu(transmitted(reference, stars))
     outside = np.abs(determinant(reference)) >= SMALLEST_DETERMINANT
-    errors = {name: star_errors(scheme.recover(measured), stars) for name, scheme in schemes.items()}
+    errors = {
+        name: star_errors.star_errors(scheme.recover(measured), stars) for name, scheme in schemes.items()
+    }
     return document | {"scheme_outside_zone": {name: statistics(v, outside) for name, v in errors.items()}}

@@ -228,11 +228,9 @@ class Patches:
         names = "exposure", "scale", "chi2_per_dof", "departure_percent", "weight"
         columns = numbers[self.exposure], self.scale, self.flatness, 100.0 * self.departure, self.weight
         rows = zip(*(values.tolist() for values in columns), strict=True)
-        return {
-            "depolarisation": self.depolarisation,
-            "patches": [dict(zip(names, row, strict=True)) for row in rows],
-            "doubted": numbers[self.exposure[self.doubted]].tolist(),
-        }
+        patches = [dict(zip(names, row, strict=True)) for row in rows]
+        doubted = numbers[self.exposure[self.doubted]].tolist()
+        return {"depolarisation": self.depolarisation, "patches": patches, "doubted": doubted}
 
 
 def judge_patches(calset: CalibrationSet, calibration: Calibration) -> Patches:

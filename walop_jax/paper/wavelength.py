@@ -73,15 +73,12 @@ def colour_spread(
 
 def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
     """Median and maximum in per cent, and the shares of the field below 0.01 % and 0.05 %."""
-    return {
-        name: {
-            "median": 100.0 * float(np.median(values)),
-            "max": 100.0 * float(values.max()),
-            "share_negligible": float(np.mean(values < NEGLIGIBLE)),
-            "share_below_sensitivity": float(np.mean(values < GOAL)),
-        }
-        for name, values in zip(("q", "u"), spread.T, strict=True)
-    }
+    document = {}
+    for name, values in zip("qu", spread.T, strict=True):
+        shares = {"share_negligible": values < NEGLIGIBLE, "share_below_sensitivity": values < GOAL}
+        sizes = {"median": 100.0 * float(np.median(values)), "max": 100.0 * float(values.max())}
+        document[name] = sizes | {key: float(np.mean(below)) for key, below in shares.items()}
+    return document
 
 
 def plate_names(instrument: Instrument) -> tuple[str, ...]:

@@ -102,10 +102,9 @@ class CandidateExposure(NamedTuple):
 
     def text(self) -> str:
         """In a few words."""
-        places = (
-            f"{p} {ANY if self.free and p == CALIBRATION_PLATE else 'out' if a is None else f'{a:g}°'}"
-            for p, a in self.positions.items()
-        )
+        stands = {p: "out" if a is None else f"{a:g}°" for p, a in self.positions.items()}
+        stands |= {CALIBRATION_PLATE: ANY} if self.free else {}
+        places = (f"{p} {where}" for p, where in stands.items())
         return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
 
 
@@ -214,9 +213,8 @@ class Available:
         if not plan.site.known:
             advice = "the site is not known; give it in the description, under [site]"
             return (), [f"{what} are left out: {advice}"]
-        e = with_stops(
-            plan, [Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)]
-        ).exposures()
+        stops = [Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)]
+        e = with_stops(plan, stops).exposures()
         visible, why = self._visible(e)
         if self.throughout and visible.any():
             # Standards are chosen when their time has come: only the Moon has a place.
@@ -252,10 +250,8 @@ class Available:
 
     def in_whole_seconds(self) -> Available:
         """The same with exposure times of whole seconds, which schedules need."""
-        whole = {
-            k: tuple(dict.fromkeys(max(1.0, float(round(t))) for t in ts)) for k, ts in self.seconds.items()
-        }
-        return dataclasses.replace(self, seconds=whole)
+        rounded = {k: [max(1.0, float(round(t))) for t in ts] for k, ts in self.seconds.items()}
+        return dataclasses.replace(self, seconds={k: tuple(dict.fromkeys(ts)) for k, ts in rounded.items()})
 
     def _better(self) -> str:
         """The next time at which the Moon is full, high and the sky dark."""

@@ -107,10 +107,9 @@ def check_wishes(minutes: float, goal: float | None = None, draws: int = 1) -> N
     if not minutes > 0:
         raise ValueError(f"{minutes:g} minutes: nothing can be observed in no time; give --minutes")
     if not minutes <= LONGEST:
-        raise ValueError(
-            f"{minutes:g} minutes: a plan is one of a night, of {LONGEST:g} minutes at most; for a longer time plan "
-            "a night, and add to its calibration with --after RUN"
-        )
+        what = f"a plan is one of a night, of {LONGEST:g} minutes at most"
+        advice = "for a longer time plan a night, and add to its calibration with --after RUN"
+        raise ValueError(f"{minutes:g} minutes: {what}; {advice}")
     if goal is not None and not 0 < goal < np.inf:
         raise ValueError(f"goal = {goal:g}: no time reaches it; give a value above 0, in % for errors of p")
     if draws < 1:

@@ -14,6 +14,7 @@ Limits       Detectors are linear. Exposures know of each other only by the para
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -37,15 +38,8 @@ from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
+from walop_jax.simulation import simulate as simulation
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
-from walop_jax.simulation.simulate import (
-    PhotonNoise,
-    draw_instrument,
-    effect_from_text,
-    fluxes,
-    simulate,
-    truth_values,
-)
 
 NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
 """Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
@@ -127,7 +121,7 @@ def candidates(
     first = np.cumsum([0, *map(len, stops)])
     plan = with_stops(few, itertools.chain(*stops))
     tell("expected counts")
-    calset = simulate(plan, seed=seed, noiseless=True, steady=True).calset
+    calset = simulation.simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
     kinds = (*catalogue, *(effect.kind for effect in effects if isinstance(effect, Effect)))
     model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
@@ -135,8 +129,9 @@ def candidates(
     for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
         values[:, i] = model.parameters[i].start
     likelihood = Likelihood.of(calset, model)
-    factor, flux, exptime = _factor(available.plan, few), fluxes(plan, None), plan.exposures().exptime
-    noise, floor = PhotonNoise(plan.read_noise), model.template.cameras.floor
+    factor, flux = _factor(available.plan, few), simulation.fluxes(plan, None)
+    exptime = plan.exposures().exptime
+    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
@@ -179,15 +174,14 @@ def _with(
     for item in given:
         effect = item
         if isinstance(item, str) and "=" in item:
-            effect = effect_from_text(item, context, model.catalogue)
+            effect = simulation.effect_from_text(item, context, model.catalogue)
         alone = isinstance(effect, str)
         name = effect.strip() if isinstance(effect, str) else effect.name
         extended = with_effects(extended, (name if alone else effect,), context)
         kind = effect_by_name(name, model.catalogue)
         if kind.is_structural():
-            raise ValueError(
-                f"{name} is there or it is not, and has no size that could be planned for; leave it out"
-            )
+            what = f"{name} is there or it is not, and has no size that could be planned for"
+            raise ValueError(f"{what}; leave it out")
         stated[name] = not alone
         for p in extended.parameters if alone else ():
             if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in kind.shape:
@@ -210,9 +204,8 @@ def fewer_points(plan: ObservingPlan) -> ObservingPlan:
 
 def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
     """Field points of a plan, beside those of stars, over those of another."""
-    many, fewer = (
-        len(p.points()) - (p.standard_grid**2 if p.standards else 0) - p.zero_stars for p in (plan, few)
-    )
+    of_stars = ((p.standard_grid**2 if p.standards else 0) + p.zero_stars for p in (plan, few))
+    many, fewer = (len(p.points()) - stars for p, stars in zip((plan, few), of_stars, strict=True))
     return many / fewer
 
 
@@ -221,14 +214,13 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
     samples = []
     for draw in range(draws):
         rng = np.random.default_rng([seed, draw])
-        truth = truth_values(draw_instrument(model, rng))
+        truth = simulation.truth_values(simulation.draw_instrument(model, rng))
         values = np.array([truth[name] for name in model.names])
         if around is not None:
             of = around.model
             covariance = around.covariance[np.ix_(of.free, of.free)]
-            deviation = of.selection() @ rng.multivariate_normal(
-                np.zeros(len(of.free)), covariance, method="eigh"
-            )
+            normal = rng.multivariate_normal(np.zeros(len(of.free)), covariance, method="eigh")
+            deviation = of.selection() @ normal
             for i, name in enumerate(model.names):
                 if name in of.names:
                     values[i] = around.values[of.index(name)] + deviation[of.index(name)]
@@ -257,11 +249,9 @@ def _nodes(choice: CandidateExposure, effects: bool) -> tuple[Stop, ...]:
     count = NODES_OF_EFFECTS if effects else 3 if choice.free else NODES
     polariser = (choice.turn / count * np.arange(count)).tolist()
     plates = (PLATE_TURN / NODES_OF_PLATE * np.arange(NODES_OF_PLATE)).tolist()
-    return tuple(
-        dataclasses.replace(choice.stops[0], polariser_angle=angle, plate=plate)
-        for plate in (plates if choice.free else [choice.stops[0].plate])
-        for angle in polariser
-    )
+    at = itertools.product(plates if choice.free else [choice.stops[0].plate], polariser)
+    stop = functools.partial(dataclasses.replace, choice.stops[0])
+    return tuple(stop(polariser_angle=angle, plate=plate) for plate, angle in at)
 
 
 def _orders(choice: CandidateExposure, angles: int) -> tuple[int, ...]:
@@ -285,7 +275,7 @@ class Illumination(NamedTuple):
     """
 
     flux: Float[np.ndarray, " p"]
-    noise: PhotonNoise
+    noise: simulation.PhotonNoise
     floor: float
     shared: Sharing
     scale: float
@@ -403,9 +393,8 @@ class Polarised(Family):
         both = 2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles)
         low = both[: len(self.orders)]
         weights = self._weights(even_angles(low))
-        finer = [
-            _interpolating(even_angles((o,))[:, 0], 2 * n + 1) for o, n in zip(self.orders, low, strict=True)
-        ]
+        pairs = zip(self.orders, low, strict=True)
+        finer = [_interpolating(even_angles((o,))[:, 0], 2 * n + 1) for o, n in pairs]
         total = np.zeros(np.prod([len(f) for f in finer]))
         for (unit, slopes), matrix in zip(self.counts, g, strict=True):
             root = _root(matrix)
@@ -427,10 +416,8 @@ class Polarised(Family):
         behind = 2 * PLATE_TURN / self.choice.turn * plate - polariser
         weights = self._weights(np.stack([behind, np.full(angles, plate)], axis=1))
         counts = tuple((_mixed(weights, unit), _mixed(weights, slopes)) for unit, slopes in self.counts)
-        orders = (ANGLES // 2 * round(self.choice.turn / 180.0),)
-        return dataclasses.replace(
-            self, choice=self.choice.with_plate(angle), counts=counts, orders=orders, known={}
-        )
+        orders, choice = (ANGLES // 2 * round(self.choice.turn / 180.0),), self.choice.with_plate(angle)
+        return dataclasses.replace(self, choice=choice, counts=counts, orders=orders, known={})
 
     def lost(self) -> float:
         """Largest relative error of the gain of all parameters between its angles; or of the counts, if more."""

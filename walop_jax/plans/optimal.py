@@ -46,6 +46,12 @@ from scipy import linalg
 from walop_jax.likelihood.inverses import root_of
 from walop_jax.plans.families import Family
 
+Weight = Float[np.ndarray, " s"]
+OfTargets = Float[np.ndarray, "r k"]
+Matrices = Float[np.ndarray, "r n n"]
+Levels = Float[np.ndarray, " g"]
+Vector = Float[np.ndarray, " v"]
+
 GAP = 0.01  # proven distance from the optimum at which the search ends
 _ROUNDS = 60  # of column generation
 _NEWTON = 80  # steps for one set of candidates
@@ -83,21 +89,21 @@ class Experiment:
     target depends on a direction nothing informs about.
     """
 
-    known: Float[np.ndarray, "r n n"]
+    known: Matrices
     targets: Float[np.ndarray, "r k n q"]
     families: tuple[Family, ...]
     budget: float
     together: int = 1
 
-    def largest(self, phi: Float[np.ndarray, "r k"]) -> Float[np.ndarray, " g"]:
+    def largest(self, phi: OfTargets) -> Levels:
         """The largest variance of each group of draws."""
         return np.asarray(phi.reshape(len(phi) // self.together, -1).max(axis=1))
 
-    def relative(self, phi: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+    def relative(self, phi: OfTargets) -> OfTargets:
         """Variances over the largest of their group."""
         return phi / np.repeat(self.largest(phi), self.together)[:, None]
 
-    def of_one(self, shares: Float[np.ndarray, "r k"]) -> Float[np.ndarray, "r k"]:
+    def of_one(self, shares: OfTargets) -> OfTargets:
         """Multipliers with sum 1 in each group."""
         total = shares.reshape(len(shares) // self.together, -1).sum(axis=1)
         return shares / np.repeat(total, self.together)[:, None]
@@ -163,7 +169,7 @@ class Allocation:
 
     family: Int[np.ndarray, " s"]
     place: list[Float[np.ndarray, " _"]]
-    weight: Float[np.ndarray, " s"]
+    weight: Weight
     value: float
     bound: float
     proof: Bound
@@ -193,17 +199,17 @@ class _Some:
         self.wide = _side_by_side(experiment.targets)
         self.per_target = (k, q)
 
-    def information(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
+    def information(self, weight: Weight) -> Matrices:
         """M(w) of every draw."""
         r, s, n, _ = self.matrices.shape
         information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
         return 0.5 * (information + np.swapaxes(information, 1, 2))
 
-    def covariance(self, weight: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r n n"]:
+    def covariance(self, weight: Weight) -> Matrices:
         """M(w)⁻¹ of every draw."""
         return np.linalg.inv(self.information(weight))
 
-    def variances(self, covariance: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, "r k"]:
+    def variances(self, covariance: Matrices) -> OfTargets:
         """φ of every target."""
         return self._by_target(self.wide * (covariance @ self.wide))
 
@@ -221,21 +227,17 @@ class _Some:
             into[:] = matrices.reshape(s, -1) @ (by_target @ by_target.swapaxes(1, 2)).reshape(k, -1).T
         return gains
 
-    def plan(
-        self, weight: Float[np.ndarray, " s"], least: float, bound: float, proof: Bound, rounds: int
-    ) -> Allocation:
+    def plan(self, weight: Weight, least: float, bound: float, proof: Bound, rounds: int) -> Allocation:
         """The candidates that cost more than `least` with their weights."""
         used = np.flatnonzero(weight * self.costs > least)
         family, place = np.array([self.chosen[i][0] for i in used]), [self.chosen[i][1] for i in used]
         return Allocation(family, place, weight[used], self.value(weight), bound, proof, rounds)
 
-    def value(self, weight: Float[np.ndarray, " s"]) -> float:
+    def value(self, weight: Weight) -> float:
         """The criterion f(w)."""
         return float(self.experiment.largest(self.variances(self.covariance(weight))).mean())
 
-    def solve(
-        self, weight: Float[np.ndarray, " s"], gap: float
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
+    def solve(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
         """Weights within `gap` of the best, and the multipliers π of the targets.
 
         Barrier: mean_g t_g − μ [Σ log(t_g − φ_rk) + Σ log w_s], g the group of r, Newton in (w, t) on the budget's
@@ -256,7 +258,7 @@ class _Some:
                 np.put_along_axis(multipliers, near, shares, axis=1)
                 return weight, multipliers
 
-    def worst(self, phi: Float[np.ndarray, "r k"]) -> _Some:
+    def worst(self, phi: OfTargets) -> _Some:
         """The same for the targets with the largest variances: whose value bounds that of all from below."""
         return self._of_targets(_nearest(self.experiment.relative(phi)))
 
@@ -269,9 +271,7 @@ class _Some:
         subset.per_target = (near.shape[1], q)
         return subset
 
-    def _solved(
-        self, weight: Float[np.ndarray, " s"], gap: float
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "r k"]]:
+    def _solved(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
         phi = self.variances(self.covariance(weight))
         constraints = phi.size + len(weight)
         level = self.experiment.largest(phi)
@@ -285,12 +285,10 @@ class _Some:
         slack = self._slack(level, self.variances(self.covariance(weight)))
         return weight, self.experiment.of_one(1.0 / np.maximum(slack, 1e-300))
 
-    def _slack(
-        self, level: Float[np.ndarray, " g"], phi: Float[np.ndarray, "r k"]
-    ) -> Float[np.ndarray, "r k"]:
+    def _slack(self, level: Levels, phi: OfTargets) -> OfTargets:
         return np.repeat(level, self.experiment.together)[:, None] - phi
 
-    def _barrier(self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " g"], mu: float) -> float:
+    def _barrier(self, weight: Weight, level: Levels, mu: float) -> float:
         if np.any(weight <= 0):
             return np.inf
         try:
@@ -301,9 +299,7 @@ class _Some:
             return np.inf
         return float(level.mean() - mu * (np.log(slack).sum() + np.log(weight).sum()))
 
-    def _centred(
-        self, weight: Float[np.ndarray, " s"], level: Float[np.ndarray, " g"], mu: float, enough: float
-    ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " g"]]:
+    def _centred(self, weight: Weight, level: Levels, mu: float, enough: float) -> tuple[Weight, Levels]:
         """Newton's method for one μ, until its decrement is `enough` of μ."""
         s, r = len(weight), len(level)
         sample = slice(None, None, -(-len(self.wide) // _BENT))
@@ -358,15 +354,13 @@ def _side_by_side(targets: Float[np.ndarray, "r k n q"]) -> Float[np.ndarray, "r
     return np.moveaxis(targets, 2, 1).reshape(r, n, -1)
 
 
-def _nearest(relative: Float[np.ndarray, "r k"]) -> Int[np.ndarray, "r l"]:
+def _nearest(relative: OfTargets) -> Int[np.ndarray, "r l"]:
     """Numbers of the targets that come near the largest, as many in each draw."""
     count = int((relative >= _NEAR).sum(axis=1).max())
     return np.argsort(-relative, axis=1)[:, :count]
 
 
-def _on_the_budget(
-    hessian: Float[np.ndarray, "v v"], gradient: Float[np.ndarray, " v"], cost: Float[np.ndarray, " v"]
-) -> Float[np.ndarray, " v"]:
+def _on_the_budget(hessian: Float[np.ndarray, "v v"], gradient: Vector, cost: Vector) -> Vector:
     """The Newton step that leaves cost · step = 0."""
     size = np.sqrt(np.diag(hessian))
     factor = linalg.cho_factor(hessian / np.outer(size, size) + _ROUNDING * len(size) * np.eye(len(size)))
@@ -376,10 +370,7 @@ def _on_the_budget(
 
 
 def optimise(
-    experiment: Experiment,
-    *,
-    gap: float = GAP,
-    progress: Callable[[str], None] | None = None,
+    experiment: Experiment, *, gap: float = GAP, progress: Callable[[str], None] | None = None
 ) -> Allocation:
     """The plan with the least criterion, to a proven relative `gap`, and the proof.
 
@@ -434,11 +425,7 @@ def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.n
     return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=_ONE_PLACE, rtol=0.0))
 
 
-def lower_bound(
-    experiment: Experiment,
-    covariance: Float[np.ndarray, "r n n"],
-    shares: Float[np.ndarray, "r k"],
-) -> Bound:
+def lower_bound(experiment: Experiment, covariance: Matrices, shares: OfTargets) -> Bound:
     """The least criterion that any plan can have (see the module).
 
     `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each group. Any of both gives
@@ -495,15 +482,12 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     problem = experiment.reduced()
     chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
     if chosen.costs.min() > problem.budget:
-        raise ValueError(
-            f"the budget, {problem.budget:g}, is less than the cheapest candidate costs: {chosen.costs.min():g}"
-        )
+        cheapest = f"the cheapest candidate costs: {chosen.costs.min():g}"
+        raise ValueError(f"the budget, {problem.budget:g}, is less than {cheapest}")
     count = _filled(chosen, np.floor(plan.weight + 1e-9), plan.weight)
     if chosen.value(count) > _HOPELESS * plan.value:
-        raise NotEstimableError(
-            f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates, which do not determine all "
-            "targets: raise it"
-        )
+        what = f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates"
+        raise NotEstimableError(f"{what}, which do not determine all targets: raise it")
     for _ in range(_EXCHANGES):
         chosen, count, better = _exchanged(chosen, count)
         if not better:
@@ -511,9 +495,7 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
     return chosen.plan(count, 0.0, plan.bound, plan.proof, plan.rounds)
 
 
-def worth(
-    experiment: Experiment, plan: Allocation
-) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+def worth(experiment: Experiment, plan: Allocation) -> tuple[Weight, Weight]:
     """The criterion without each candidate of a plan, and with one more of it, over that of the plan."""
     problem = experiment.reduced()
     chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
@@ -523,9 +505,7 @@ def worth(
     return np.array(without) / value, np.array(added) / value
 
 
-def _filled(
-    some: _Some, count: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]
-) -> Float[np.ndarray, " s"]:
+def _filled(some: _Some, count: Weight, weight: Weight) -> Weight:
     """Spend the remaining budget, one candidate at a time."""
     while True:
         remaining = some.experiment.budget - some.costs @ count
@@ -540,7 +520,7 @@ def _filled(
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
 
 
-def _exchanged(support: _Some, count: Float[np.ndarray, " s"]) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
+def _exchanged(support: _Some, count: Weight) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
     problem, value = support.experiment, support.value(count)
     covariance = support.covariance(count)

@@ -28,28 +28,11 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
+from walop_jax.plans import criteria, optimal
 from walop_jax.plans.available import Available, with_stops
-from walop_jax.plans.criteria import (
-    APART,
-    NAMED,
-    WORST,
-    Criterion,
-    FieldErrors,
-    check_wishes,
-    criterion_by_name,
-    field_errors,
-)
+from walop_jax.plans.criteria import Criterion, FieldErrors
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
-from walop_jax.plans.optimal import (
-    GAP,
-    Allocation,
-    Experiment,
-    NotEstimableError,
-    least_budget,
-    optimise,
-    rounded,
-    worth,
-)
+from walop_jax.plans.optimal import GAP, Allocation, Experiment, NotEstimableError
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.sky.directions import separation
 
@@ -99,6 +82,16 @@ class PlannedExposure:
     change: float
     place: int | None = None
 
+    def cells(self) -> tuple[str, ...]:
+        """The row of the table of a plan."""
+        number = "" if self.number < 0 else f" {self.number}"
+        positions = ", ".join(f"{p} {_angle(a)}" for p, a in self.positions.items())
+        angle = _angle(self.polariser_angle if np.isfinite(self.polariser_angle) else None)
+        exposures, time = f"{self.times} × {self.exptime:g} s", f"{self.seconds + self.change:.0f}"
+        what = f"{self.kind}{number}" + ("" if self.place is None else f" at {self.place}")
+        loss = f"{100 * (np.sqrt(self.left_out) - 1):+.2g} %"
+        return (what, self.filter, positions, angle, exposures, time, loss)
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ExposurePlan(Displayed):
@@ -106,11 +99,10 @@ class ExposurePlan(Displayed):
 
     `value` is the criterion of the exposures, `bound` the least value of any plan of the same time, both as `criteria`
     reports them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
-    none can.
-    `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure holds no u.
-    `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left out, and
-    what these exposures alone cannot show. The bound holds for all angles of the polariser, and of the calibration
-    plate behind it if `any_plate`.
+    none can. `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure
+    holds no u. `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left
+    out, and what these exposures alone cannot show. The bound holds for all angles of the polariser, and of the
+    calibration plate behind it if `any_plate`.
     """
 
     minutes: float
@@ -149,28 +141,18 @@ class ExposurePlan(Displayed):
 
     def document(self) -> dict[str, Any]:
         """The plan as plain data."""
+        asked = self.criterion
         document: dict[str, Any] = {
-            "minutes": self.minutes,
-            "seconds": self.seconds,
+            "minutes": self.minutes, "seconds": self.seconds,
             "exposures": [dataclasses.asdict(line) for line in self.lines],
-            "criterion": self.criterion.name,
-            "what": self.criterion.what,
-            "unit": self.criterion.unit,
-            "value": self.value,
-            "bound": self.bound,
-            "gap": self.gap,
-            "gap_of_weights": self.weights_gap,
-            "any_plate": self.any_plate,
-            "truncation": self.truncation,
-            "goal": self.goal,
+            "criterion": asked.name, "what": asked.what, "unit": asked.unit, "value": self.value,
+            "bound": self.bound, "gap": self.gap, "gap_of_weights": self.weights_gap,
+            "any_plate": self.any_plate, "truncation": self.truncation, "goal": self.goal,
             "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
-            "draws": len(self.after),
-            "share_below_goal": self.share,
-            "beside": dict(self.beside),
-            "notes": list(self.notes),
-            "plan": self.observing_plan.document(),
-        }
-        if self.criterion.name == WORST:
+            "draws": len(self.after), "share_below_goal": self.share, "beside": dict(self.beside),
+            "notes": list(self.notes), "plan": self.observing_plan.document(),
+        }  # fmt: skip
+        if self.criterion.name == criteria.WORST:
             document |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
         if len(self.x):
             before, after = np.median(self.before, axis=0), np.median(self.after, axis=0)
@@ -196,34 +178,19 @@ class ExposurePlan(Displayed):
                 f"in {100 * self.share:.0f} % of the field where one exposure measures u"
             )
         if self.needed is not None:
-            facts[f"{digits(self.goal, '.3g')}{unit} takes"] = (
-                f"{digits(self.needed[0], '.3g')} min, not counting changes; no plan needs less than "
-                f"{digits(self.needed[1], '.3g')} min"
-            )
+            best, least = (f"{digits(minutes, '.3g')} min" for minutes in self.needed)
+            takes = f"{best}, not counting changes; no plan needs less than {least}"
+            facts[f"{digits(self.goal, '.3g')}{unit} takes"] = takes
         variance_of_plan = self.criterion.variance(self.value)
         for name, other_value in self.beside.items():
             factor = self.criterion.variance(other_value) / variance_of_plan
             variance = "equally good" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
             facts[name] = f"{digits(other_value, '.3g')}{unit}; {variance}"
-        rows = tuple(
-            (
-                line.kind
-                if line.number < 0
-                else f"{line.kind} {line.number}" + ("" if line.place is None else f" at {line.place}"),
-                line.filter,
-                ", ".join(f"{p} {_angle(a)}" for p, a in line.positions.items()),
-                _angle(line.polariser_angle if np.isfinite(line.polariser_angle) else None),
-                f"{line.times} × {line.exptime:g} s",
-                f"{line.seconds + line.change:.0f}",
-                f"{100 * (np.sqrt(line.left_out) - 1):+.2g} %",
-            )
-            for line in self.lines
-        )
         return Display(
             title=f"Plan of {sum(line.times for line in self.lines)} exposures for {self.observing_plan.name}",
             facts=tuple(facts.items()),
             head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
-            rows=rows,
+            rows=tuple(line.cells() for line in self.lines),
             notes=self.notes,
         )
 
@@ -236,7 +203,7 @@ def plan_exposures(
     available: Available | ObservingPlan,
     minutes: float,
     *,
-    criterion: str | InputTable = WORST,
+    criterion: str | InputTable = criteria.WORST,
     known: Calibration | None = None,
     goal: float | None = None,
     draws: int = DRAWS,
@@ -254,9 +221,9 @@ def plan_exposures(
     that pays for nothing, NotEstimableError where nothing that could be observed, or too little in that time,
     determines the criterion.
     """
-    check_wishes(minutes, goal, draws)
+    criteria.check_wishes(minutes, goal, draws)
     if apart:
-        criterion, goal = APART, NAMED if goal is None else goal
+        criterion, goal = criteria.APART, criteria.NAMED if goal is None else goal
     choices = candidates(
         Available.of(available), draws=draws, seed=seed, around=known, effects=apart, catalogue=catalogue,
         progress=progress,
@@ -265,9 +232,9 @@ def plan_exposures(
         progress("criterion")
     two_arms = len(choices.model.template.cameras.pairs) == 2
     over_field = criterion in ("worst", "mean")  # raises, with advice, for other numbers of arms
-    field = field_errors(choices) if over_field or (two_arms and not apart) else None
+    field = criteria.field_errors(choices) if over_field or (two_arms and not apart) else None
     return plan_from(
-        choices, minutes, criterion_by_name(choices, field, criterion), field,
+        choices, minutes, criteria.criterion_by_name(choices, field, criterion), field,
         known=None if known is None else information_of(known, choices.names, choices.effects),
         goal=goal, gap=gap, progress=progress,
     )  # fmt: skip
@@ -286,17 +253,15 @@ def plan_from(
 ) -> ExposurePlan:
     """As `plan_exposures`, from candidates that are there; `known` is the information of earlier measurements."""
     tell = progress or (lambda text: None)
-    check_wishes(minutes, goal)
+    criteria.check_wishes(minutes, goal)
     shortest = min(choice.seconds + found.available.costs.of(choice.kind) for choice in found.choices)
     if 60.0 * minutes < shortest:
-        raise ValueError(
-            f"{minutes:g} minutes do not pay for a single exposure: the shortest takes {shortest / 60:.2g}, with "
-            "read-out or pointing"
-        )
+        what = f"the shortest takes {shortest / 60:.2g}, with read-out or pointing"
+        raise ValueError(f"{minutes:g} minutes do not pay for a single exposure: {what}")
     tell("looking for the best plan")
     problem = experiment_of(found, minutes, criterion, known)
     try:
-        weights = optimise(problem, gap=0.5 * gap, progress=tell)
+        weights = optimal.optimise(problem, gap=0.5 * gap, progress=tell)
         if weights.proof.ratio * problem.budget < _NOTHING * weights.proof.known:
             raise NotEstimableError
     except NotEstimableError:
@@ -311,7 +276,7 @@ def plan_from(
     if goal is not None:
         tell("how long the goal takes")
         try:
-            cheapest, least = least_budget(problem, criterion.variance(goal), gap=gap)
+            cheapest, least = optimal.least_budget(problem, criterion.variance(goal), gap=gap)
             needed = (_cost(problem, cheapest.weights) / 60.0, least / 60.0)
         except NotEstimableError:
             reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
@@ -321,10 +286,8 @@ def plan_from(
     spacing = round(minutes / max(sum(line.times for line in lines), 1), 3)
     plan = with_stops(chosen.available.plan, stops, spacing=spacing)
     none = np.zeros((len(found.values), 0))
-    before, after = (
-        none if field is None else field.error(covariance(information))
-        for information in (experiment.known, total)
-    )
+    of_both = experiment.known, total
+    before, after = (none if field is None else field.error(covariance(m)) for m in of_both)
     # Earlier measurements may hold what these lack.
     unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
     return ExposurePlan(
@@ -348,8 +311,7 @@ def plan_from(
     )
 
 
-Weights = Mapping[tuple[int, tuple[float, ...]], float]
-"""Numbers of exposures, by choice and place."""
+Weights = Mapping[tuple[int, tuple[float, ...]], float]  # numbers of exposures, by choice and place
 
 
 def experiment_of(
@@ -398,7 +360,7 @@ def _at_few_angles(
             continue
         problem = experiment(chosen)
         try:
-            trial = _whole(chosen, problem, optimise(problem, gap=0.5 * gap) if free else weights)
+            trial = _whole(chosen, problem, optimal.optimise(problem, gap=0.5 * gap) if free else weights)
         except ValueError as error:
             failure = error
             continue
@@ -436,19 +398,18 @@ def _within(
     for _ in range(_TRIES):
         remaining = budget - changes
         if remaining <= 0:
-            raise ValueError(
-                f"{budget / 60:g} minutes: changes of filter, moving elements and pointing alone take "
-                f"{changes / 60:.1f}; give more time, or fewer filters and settings"
-            )
+            what = f"changes of filter, moving elements and pointing alone take {changes / 60:.1f}"
+            advice = "give more time, or fewer filters and settings"
+            raise ValueError(f"{budget / 60:g} minutes: {what}; {advice}")
         families = tuple(experiment.families[i] for i in allowed)
         problem = dataclasses.replace(experiment, families=families, budget=remaining)
-        scaled = dataclasses.replace(
-            weights,
-            family=np.array([allowed.index(weights.family[i]) for i in at]),
-            place=[weights.place[i] for i in at],
-            weight=weights.weight[at] * remaining / budget,
+        family, place = (
+            np.array([allowed.index(weights.family[i]) for i in at]),
+            [weights.place[i] for i in at],
         )
-        integer = rounded(problem, scaled)
+        weight = weights.weight[at] * remaining / budget
+        scaled = dataclasses.replace(weights, family=family, place=place, weight=weight)
+        integer = optimal.rounded(problem, scaled)
         integer = dataclasses.replace(integer, family=np.array([allowed[i] for i in integer.family]))
         lines = _ordered(found, integer)
         between = sum(_changes(found, lines))
@@ -526,15 +487,13 @@ def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
 ) -> Iterator[PlannedExposure]:
     keys = list(best.weights)
-    without, added = worth(experiment, best)
+    without, added = optimal.worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
         stop = choice.stop(line.place)
         seconds = float(experiment.families[line.choice].cost_at(np.atleast_2d(line.place))[0])
         yield PlannedExposure(
-            kind=choice.kind,
-            filter=choice.filter,
-            positions=choice.positions,
+            *(choice.kind, choice.filter, choice.positions),
             polariser_angle=float("nan") if stop.polariser_angle is None else stop.polariser_angle,
             number=stop.number if choice.kind in ("moon", "standard") else -1,
             times=line.times,

@@ -8,9 +8,8 @@ laplace   half of the steps propose a draw of N(0, 1.1² 1), whatever the positi
 de        differential evolution (ter Braak 2006, Stat. Comput. 16, 239), one step in ten with γ = 1.
 stretch   emcee's default (Goodman & Weare 2010).
 
-emcee's DESnookerMove is not offered: in emcee 3.1.6 its proposals carry half the logarithm of the Jacobian
-that they need (dfm/emcee pull request 531), and widths come out 8 % too small at 16 dimensions with 20 % of
-it.
+emcee's DESnookerMove is not offered: in emcee 3.1.6 its proposals carry half the logarithm of the Jacobian that they
+need (dfm/emcee pull request 531), and widths come out 8 % too small at 16 dimensions with 20 % of it.
 """
 
 from __future__ import annotations
@@ -80,12 +79,8 @@ class Emcee(Sampler):
 
 def emcee_state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " w"], random: Any) -> State:
     """The state of an ensemble; `random` is that of a Mersenne twister."""
-    return {
-        "positions": positions,
-        "log_density": value,
-        "random_keys": random[1],
-        "random_rest": np.array(random[2:], float),
-    }
+    numbers = {"random_keys": random[1], "random_rest": np.array(random[2:], float)}
+    return {"positions": positions, "log_density": value, **numbers}
 
 
 def random_attributes(state: State) -> dict[str, Any]:

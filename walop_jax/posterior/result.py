@@ -100,26 +100,23 @@ def autocorrelation(chains: Chains) -> Float[np.ndarray, " k"]:
 
 def r_hat(chains: Chains) -> Float[np.ndarray, " k"]:
     """R-hat between the halves of all ensembles, per quantity; NaN for a quantity that never moved."""
+    from arviz_stats.base.array import array_stats
+
     e, k = chains.shape[0], chains.shape[-1]
     thinned = chains[:, :: max(1, chains[..., 0].size // RANKED)]
-    rhat: Any = _statistics().rhat
+    rhat: Any = array_stats.rhat
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.array([float(rhat(thinned[..., i].reshape(e, -1))) for i in range(k)])
 
 
 def effective_samples(chains: Chains) -> Float[np.ndarray, " k"]:
     """Number of independent draws that would give means as good, per quantity."""
-    e, n, w, k = chains.shape
-    walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
-    ess: Any = _statistics().ess
-    return np.array([float(ess(walkers[..., i], method="mean")) for i in range(k)])
-
-
-def _statistics() -> Any:
-    """ArviZ's statistics of arrays, (chain, draw); imported when a posterior is judged."""
     from arviz_stats.base.array import array_stats
 
-    return array_stats
+    e, n, w, k = chains.shape
+    walkers = np.moveaxis(chains, 2, 1).reshape(e * w, n, k)
+    ess: Any = array_stats.ess
+    return np.array([float(ess(walkers[..., i], method="mean")) for i in range(k)])
 
 
 def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
@@ -129,21 +126,14 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
     calset, gathered = likelihood.calset, likelihood.points.gathered
     used = likelihood.used
     point, exposure = np.nonzero(used)
-    place = {
-        "point": ("row", calset.points.point[point]),
-        "exposure": ("row", calset.exposures.exposure[exposure]),
-        "camera": list(likelihood.model.template.cameras.names),
-    }
+    names = list(likelihood.model.template.cameras.names)
+    number, exposures = calset.points.point[point], calset.exposures.exposure[exposure]
+    place = {"point": ("row", number), "exposure": ("row", exposures), "camera": names}
     x, y, errors = calset.points.x[point], calset.points.y[point], 1.0 / gathered("weight")[used]
-    columns = {
-        "observed_data": {"N": gathered("counts")[used]},
-        "constant_data": {"N_ERR": errors, "X": x, "Y": y},
-    }
-    dims = ("row", "camera")
-    return {
-        group: Dataset({name: (dims[: values.ndim], values) for name, values in column.items()}, coords=place)
-        for group, column in columns.items()
-    }
+    dims, counts = ("row", "camera"), gathered("counts")[used]
+    constant = {"N_ERR": (dims, errors), "X": ("row", x), "Y": ("row", y)}
+    groups = {"observed_data": {"N": (dims, counts)}, "constant_data": constant}
+    return {group: Dataset(columns, coords=place) for group, columns in groups.items()}
 
 
 def arviz_of_fit(result: FitResult, draws: int, seed: int) -> Any:
@@ -239,9 +229,8 @@ class Options:
         if min(self.interval, self.draws, self.checks, self.maximum_steps) < 1 or self.thin < 0:
             raise ValueError("interval, draws, checks and maximum_steps must be 1 or more, thin not negative")
         if self.maximum_steps < self.interval:
-            raise ValueError(
-                f"maximum_steps {self.maximum_steps} is less than one block: lower interval ({self.interval}) as well"
-            )
+            what = f"maximum_steps {self.maximum_steps} is less than one block"
+            raise ValueError(f"{what}: lower interval ({self.interval}) as well")
         thin = self.thin or sampler.thin
         if self.interval % thin:
             raise ValueError(f"interval {self.interval} must be a multiple of thin {thin}")
@@ -383,13 +372,11 @@ class PosteriorSample(Drawn):
                 about = f"{'lower' if side == 'LOW' else 'upper'} end of the {label} % interval"
                 columns[f"{side}{label}"] = np.quantile(values, level, axis=0), "", about
         v = self.convergence
-        for name, numbers, about in (
-            ("TAU", v.tau, "autocorrelation time in steps"),
-            ("ESS", v.ess, "effective samples"),
-            ("RHAT", v.rhat, "R-hat between ensembles"),
-        ):
+        abouts = "autocorrelation time in steps", "effective samples", "R-hat between ensembles"
+        evidence = zip(("TAU", "ESS", "RHAT"), (v.tau, v.ess, v.rhat), abouts, strict=True)
+        for key, numbers, about in evidence:
             by_name = dict(zip(v.names, numbers, strict=True))
-            columns[name] = np.array([by_name.get(name_, np.nan) for name_ in names]), "", about
+            columns[key] = np.array([by_name.get(name, np.nan) for name in names]), "", about
         return columns
 
     def to_table(self) -> Any:
@@ -450,21 +437,18 @@ class PosteriorSample(Drawn):
             evidence = {"autocorrelation_steps": v.tau[k], "effective_samples": v.ess[k], "r_hat": v.rhat[k]}
             posterior[name].attrs.update({key: float(value) for key, value in evidence.items()})
             posterior[name].attrs["sampled_by"] = self.sampler
+        held = {n: float(self.draws[0, 0, i]) for i, n in enumerate(self.names) if i not in varies}
         posterior.attrs.update(
-            {
-                "sampler": self.sampler,
-                "interval": "equal-tailed",
-                "converged": int(v.converged),
-                "trusted": int(self.trusted),
-                "verdict": v.message() if self.of_trusted_fit else "the fit is not trusted",
-                "steps": v.steps,
-                "acceptance": self.acceptance,
-                "fingerprint": json.dumps(self.fingerprint),
-                "fit": self.fit,
-                "fixed": json.dumps(
-                    {n: float(self.draws[0, 0, i]) for i, n in enumerate(self.names) if i not in varies}
-                ),
-            }
+            sampler=self.sampler,
+            interval="equal-tailed",
+            converged=int(v.converged),
+            trusted=int(self.trusted),
+            verdict=v.message() if self.of_trusted_fit else "the fit is not trusted",
+            steps=v.steps,
+            acceptance=self.acceptance,
+            fingerprint=json.dumps(self.fingerprint),
+            fit=self.fit,
+            fixed=json.dumps(held),
         )
         if self.accuracy is not None:
             numbers = {"efficiency": self.accuracy.efficiency, "spread": self.accuracy.spread}
@@ -502,7 +486,14 @@ class PosteriorSample(Drawn):
 
     def document(self) -> dict[str, Any]:
         """The content of `sample.json`, as plain data."""
-        v, a = self.convergence, self.accuracy
+        v, a, checked = self.convergence, self.accuracy, None
+        if a is not None:
+            checked = {"draws_checked": a.count, "spread": a.spread, "efficiency": a.efficiency}
+            checked |= {"largest_shift_sigma": list(a.shift), "largest_width_factor": list(a.width)}
+
+        def by_name(numbers: Vector) -> dict[str, float]:
+            return dict(zip(v.names, numbers.tolist(), strict=True))
+
         return {
             "sampler": self.sampler,
             "errors_from": self.errors_from,
@@ -514,20 +505,12 @@ class PosteriorSample(Drawn):
             "walkers": int(self.chains.shape[2]),
             "ensembles": int(self.chains.shape[0]),
             "acceptance": self.acceptance,
-            "autocorrelation_steps": {n: float(t) for n, t in zip(v.names, v.tau, strict=True)},
+            "autocorrelation_steps": by_name(v.tau),
             "autocorrelation_history": list(v.history),
-            "effective_samples": {n: float(t) for n, t in zip(v.names, v.ess, strict=True)},
-            "r_hat": {n: float(t) for n, t in zip(v.names, v.rhat, strict=True)},
+            "effective_samples": by_name(v.ess),
+            "r_hat": by_name(v.rhat),
             "sampler_counts": dict(self.counts),
-            "surrogate": None
-            if a is None
-            else {
-                "draws_checked": a.count,
-                "spread": a.spread,
-                "efficiency": a.efficiency,
-                "largest_shift_sigma": list(a.shift),
-                "largest_width_factor": list(a.width),
-            },
+            "surrogate": checked,
             "seconds": self.seconds,
             "fingerprint": self.fingerprint,
         }

@@ -140,14 +140,12 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             raise fail("was fitted with another model", file=self.folder, advice=advice)
         likelihood = Likelihood.of(calset, model)
         if likelihood.layout.large:
-            what = (
-                f"has {len(calset.points)} field points: the posterior of so many is as good as normal, and"
-            )
+            what = "the posterior of so many is as good as normal, and calibration.fits holds its covariance"
             advice = (
                 f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one"
             )
-            path = calibration.inputs[0].path
-            raise fail(f"{what} calibration.fits holds its covariance", file=path, advice=advice)
+            many = f"has {len(calset.points)} field points"
+            raise fail(f"{many}: {what}", file=calibration.inputs[0].path, advice=advice)
         values = calibration.values[fitted]
         result = fit(likelihood, start=values)
         away = np.abs(result.values - values) / np.where(result.sigma > 0, result.sigma, 1.0)
@@ -174,12 +172,10 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         accuracy = documents.get("summary", {}).get("accuracy_of_p")
         if accuracy and documents["summary"].get("trusted"):
             share = f"below 0.1 % over {100 * accuracy['share_below_goal']:.0f} % of it"
-            facts.append(
-                ("p of a star", f"{two_digits(100 * accuracy['median'])} % (median of the field), {share}")
-            )
+            median = f"{two_digits(100 * accuracy['median'])} % (median of the field)"
+            facts.append(("p of a star", f"{median}, {share}"))
         others = {n: d["shown"]["title"] for n, d in documents.items() if "shown" in d and n != "summary"}
         facts += others.items()
         inner = Display("") if self.calibration is None else self.calibration.display()
-        return dataclasses.replace(
-            inner, title=f"Run {self.folder}. {inner.title}".removesuffix(". "), facts=(*facts, *inner.facts)
-        )
+        title = f"Run {self.folder}. {inner.title}".removesuffix(". ")
+        return dataclasses.replace(inner, title=title, facts=(*facts, *inner.facts))

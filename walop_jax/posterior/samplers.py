@@ -29,8 +29,7 @@ SAMPLERS = {"emcee": "walop_jax.posterior.emcee:Emcee", "nuts": "walop_jax.poste
 Positions = Float[np.ndarray, "n k"]
 Batch = Callable[[Positions], Float[np.ndarray, " n"]]
 
-State = Mapping[str, np.ndarray]
-"""All there is to an ensemble between two steps, as named arrays."""
+State = Mapping[str, np.ndarray]  # all there is to an ensemble between two steps, as named arrays
 
 
 @dataclasses.dataclass(frozen=True)

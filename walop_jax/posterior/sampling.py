@@ -19,24 +19,17 @@ from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
+from walop_jax.posterior import result as results
 from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
 from walop_jax.posterior.files import Chain
-from walop_jax.posterior.result import (
-    BURN_IN,
-    Chains,
-    Convergence,
-    Options,
-    PosteriorSample,
-    Progress,
-    Report,
-    assess,
-)
+from walop_jax.posterior.result import Chains, Convergence, Options, PosteriorSample, Progress
 from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
 from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
 Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
+Report = Callable[[Progress], None] | None
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 OF_LENGTH, OF_SAMPLER = ("maximum_steps", "draws", "checks"), ("sampler", "walkers", "moves")
@@ -114,11 +107,11 @@ class Ensembles:
     def kept(self) -> tuple[Chains, Float[np.ndarray, "e t w"]]:
         """Stored positions and ln p after burn-in."""
         z, lnp, _ = (np.stack(series) for series in zip(*(s[:3] for s in self.stretches), strict=True))
-        first = int(BURN_IN * z.shape[1])
+        first = int(results.BURN_IN * z.shape[1])
         return z[:, first:], lnp[:, first:]
 
     def until_converged(
-        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report | None = None
+        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report = None
     ) -> Convergence:
         """Go on until the rules of convergence hold or another block would exceed `maximum_steps`; returns the verdict.
 
@@ -128,7 +121,7 @@ class Ensembles:
         while True:
             verdict = None
             if self.blocks:
-                verdict = assess(monitored(self.kept()[0]), tuple(names), self.thin)
+                verdict = results.assess(monitored(self.kept()[0]), tuple(names), self.thin)
                 if verdict.converged or self.steps + self.options.interval > most:
                     return verdict
             if report is not None:
@@ -182,7 +175,7 @@ def sample(
     *,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
-    report: Report | None = None,
+    report: Report = None,
 ) -> PosteriorSample:
     """Sample the posterior around a fit until it has converged or `maximum_steps` are done.
 

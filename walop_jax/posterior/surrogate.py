@@ -12,9 +12,8 @@ exact residuals is kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ d
     −2 ln p(z) = h (Q_hh − Q_hs Q_ss⁻¹ Q_sh) h + z · ∇_z ln det H_ss
     s | z ~ N(−Q_ss⁻¹ Q_sh h − ½ ∇_s ln det H_ss, Q_ss⁻¹)
 
-H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it
-displaces the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half
-gradients g.
+H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it displaces
+the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half gradients g.
 
 With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
 eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1). Its coordinate is ln f √(2n).
@@ -54,10 +53,9 @@ BENT = 8  # directions that get cubic terms
 class Surrogate:
     """Everything needed to evaluate and to draw; `inflate` adds ln f as the last sampled coordinate.
 
-    x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given;
-    `linear` turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 −
-    `share` for the priors, `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the
-    monomials of h.
+    x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given; `linear`
+    turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for the priors,
+    `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h.
     """
 
     names: tuple[str, ...]
@@ -352,10 +350,6 @@ def compare_with_exact(target: Target, surrogate: Surrogate, z: Draws, rng: np.r
         return surrogate.names[i], float(mean[i]), float(error[i])
 
     shift, variance = worst(ln_ratio[:, None] * t), worst(ln_ratio[:, None] * (t**2 - 1.0))
-    return Accuracy(
-        count=len(z),
-        spread=float(np.std(ln_ratio)),
-        efficiency=float(importance.mean() ** 2 / np.mean(importance**2)),
-        shift=shift,
-        width=(variance[0], 1.0 + 0.5 * variance[1], 0.5 * variance[2]),
-    )
+    width = variance[0], 1.0 + 0.5 * variance[1], 0.5 * variance[2]
+    efficiency = float(importance.mean() ** 2 / np.mean(importance**2))
+    return Accuracy(len(z), float(np.std(ln_ratio)), efficiency, shift, width)

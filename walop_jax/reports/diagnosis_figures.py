@@ -19,29 +19,8 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.detection_limits import NO_LEVEL, DetectionLimits
 from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
 from walop_jax.fit.verdict import SUSPECT_SIGMA
-from walop_jax.reports.style import (
-    ABOVE,
-    AFTER,
-    BEFORE,
-    DIVERGING,
-    FONT,
-    NARROW,
-    PAGE,
-    QUIET,
-    SEQUENTIAL,
-    SMALL,
-    AnyFigure,
-    Canvas,
-    angle_ticks,
-    colour_bar,
-    field_axes,
-    largest_size,
-    outer_labels,
-    pixel_map,
-    plain_ticks,
-    point_map,
-    styled,
-)
+from walop_jax.reports import style
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
 
 SIGN_BEYOND = 3.0  # σ beyond which a tile carries its sign
 MOST_MARKED = 400  # points above which signs would run into each other
@@ -58,9 +37,9 @@ def residual_maps(
     `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
     3 σ carry their sign, so that the maps can be read without colours.
     """
-    far = max(largest_size(*maps.values()), SIGN_BEYOND)
+    far = max(style.largest_size(*maps.values()), SIGN_BEYOND)
     norm, signs = Normalize(-far, far), len(points) <= MOST_MARKED
-    return _maps(points, maps, cameras, norm, DIVERGING, "residual (σ)", signs, on)
+    return _maps(points, maps, cameras, norm, style.DIVERGING, "residual (σ)", signs, on)
 
 
 @styled
@@ -88,7 +67,7 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     measured = np.isfinite(overall["BEFORE"])
     rms = (np.where(measured, values, np.nan) for values in (overall["RMS_BEFORE"], overall["RMS_AFTER"]))
     maps: dict[str, PointMap] = dict(zip(_MODELS, rms, strict=True))
-    norm = Normalize(0.5, max(largest_size(*maps.values()), 1.5))
+    norm = Normalize(0.5, max(style.largest_size(*maps.values()), 1.5))
     return _maps(data.points, maps, data.cameras, norm, "magma_r", "rms residual (σ)", False, on)
 
 
@@ -109,22 +88,22 @@ def _maps(
     tiles: Any = None
     for number, values in enumerate(maps.values()):
         for k, axis in enumerate(axes[number]):
-            field_axes(axis, cameras[k] if number == 0 else "")
+            style.field_axes(axis, cameras[k] if number == 0 else "")
             axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
             if on.width is not None:
                 axis.tick_params(axis="x", labelrotation=90)
             axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
-            tiles = point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
+            tiles = style.point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
             for i in np.flatnonzero(signs & (np.abs(np.nan_to_num(values[:, k])) > SIGN_BEYOND)):
                 ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
                 look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
                 axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
-    outer_labels(axes)
+    style.outer_labels(axes)
     for row, title in zip(axes, maps, strict=True):
         for axis in row:
             if axis.get_subplotspec().is_first_col():
                 axis.set_ylabel(f"{title}\n\nY (deg)")
-    colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
+    style.colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
 
 
@@ -147,16 +126,16 @@ def signature_figure(
         shown = (column[finite, k] for column in columns)
         x, before, error, explained, after = _binned(position[finite], *shown)
         for axis, dots in ((upper[k], before), (lower[k], after)):
-            axis.axhline(0.0, color=QUIET, lw=0.8, zorder=0)
+            axis.axhline(0.0, color=style.QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
-        upper[k].plot(x, explained, color=BEFORE, lw=1.4, label="effect", zorder=2)
+        upper[k].plot(x, explained, color=style.BEFORE, lw=1.4, label="effect", zorder=2)
         upper[k].set_title(camera)
         lower[k].set_xlabel(label)
         if angular:
-            angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
+            style.angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
     upper[0].set_ylabel("residual (σ)")
     lower[0].set_ylabel("remaining (σ)")
-    figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, ncols=2, loc=ABOVE)
+    figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, ncols=2, loc=style.ABOVE)
     return figure
 
 
@@ -197,7 +176,7 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     axis.axvline(1.0, color="0.5", lw=0.8, zorder=1)
     axis.plot(ratio, place, color="0.6", lw=1.0, zorder=2)
     explains = ratio < 1.0 + width
-    for chosen, marker, colour in ((~explains, "o", BEFORE), (explains, "s", AFTER)):
+    for chosen, marker, colour in ((~explains, "o", style.BEFORE), (explains, "s", style.AFTER)):
         axis.plot(ratio[chosen], place[chosen], marker, color=colour, ms=7, lw=0, zorder=3)
     low, high = min(float(ratio.min()), 1.0 - width), max(float(ratio.max()), 1.0 + width)
     margin = (high / low) ** 0.12
@@ -207,11 +186,11 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
         axis.annotate(f"{value:.4g}", (value, y), fontsize=8, **place_of_text)
     axis.set_yticks(place, names)
     axis.set_ylim(len(ratio) - 0.5, -0.5)
-    axis.tick_params(labelsize=SMALL)
-    plain_ticks(axis.xaxis)
+    axis.tick_params(labelsize=style.SMALL)
+    style.plain_ticks(axis.xaxis)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
-    axis.tick_params(axis="y", length=0, labelsize=FONT)
+    axis.tick_params(axis="y", length=0, labelsize=style.FONT)
     return figure
 
 
@@ -235,14 +214,14 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
             axis.set_xlim(-0.6, len(rows) - 0.4)
         axis.axhline(1.0, color="0.5", lw=0.8, zorder=0)
         size = 5 if group != "exposure" else 3.5
-        axis.vlines(place, before[rows], after[rows], color=QUIET, lw=1, zorder=1)
-        axis.plot(place, before[rows], "o", color=BEFORE, ms=size, mfc="white", label="starting model")
-        axis.plot(place, after[rows], "s", color=AFTER, ms=size - 0.5, label="final model")
+        axis.vlines(place, before[rows], after[rows], color=style.QUIET, lw=1, zorder=1)
+        axis.plot(place, before[rows], "o", color=style.BEFORE, ms=size, mfc="white", label="starting model")
+        axis.plot(place, after[rows], "s", color=style.AFTER, ms=size - 0.5, label="final model")
         axis.set_xlabel(group)
     top = float(np.max(before, initial=1.0))
     if top > 5.0:
         axes[0].set_yscale("log")
-        plain_ticks(axes[0].yaxis)
+        style.plain_ticks(axes[0].yaxis)
     axes[0].set_ylabel("mean squared residual /\nwhat noise alone gives")
     axes[-1].legend(frameon=False, loc="best")
     return figure
@@ -264,7 +243,7 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
         axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
-    field_axes(axis, "largest error that goes undetected")
+    style.field_axes(axis, "largest error that goes undetected")
     percent = 100 * found.protection
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
     # Standards lie between the other points: in between the level is interpolated, where one of these is known.
@@ -272,18 +251,18 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     lines = np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)
     places = np.stack(np.meshgrid(*lines), axis=-1)
     points = np.stack([found.x, found.y], axis=1)
-    level = (
-        griddata(points[good], np.log(percent[good]), places)
-        if good.sum() > 3
-        else np.full((_PIXELS,) * 2, np.nan)
-    )
+    level = np.full((_PIXELS,) * 2, np.nan)
+    if good.sum() > 3:
+        level = griddata(points[good], np.log(percent[good]), places)
     nearest = KDTree(points).query(places)[1]
     level = np.where(np.isnan(level), np.log(percent[nearest]), level)
-    shown = pixel_map(axis, np.where(good[nearest], np.exp(level), np.nan), field, norm, SEQUENTIAL)
-    colour_bar(figure, shown, axis, "error of q, u (%)")
+    shown = style.pixel_map(
+        axis, np.where(good[nearest], np.exp(level), np.nan), field, norm, style.SEQUENTIAL
+    )
+    style.colour_bar(figure, shown, axis, "error of q, u (%)")
     axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="u not measured in one exposure")
     if not good.all():
-        figure.legend(frameon=False, loc=ABOVE)
+        figure.legend(frameon=False, loc=style.ABOVE)
     return figure
 
 
@@ -296,26 +275,22 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     count, names = len(confusable), [found.effects[i] for i in confusable]
     separation = found.separation[np.ix_(confusable, confusable)]
     width = on.width or np.inf
-    narrow = width < NARROW
+    narrow = width < style.NARROW
     size = max(1.5, 0.17 * count)
     figure, axis = on.single(*((width, 0.13 * count + 1.5) if narrow else (size + 3.2, size + 2.0)))
-    shown = axis.imshow(
-        separation,
-        norm=BoundaryNorm(_STEPS, 256, extend="max"),
-        cmap="RdYlBu",
-        aspect="auto" if narrow else "equal",
-    )
+    norm, aspect = BoundaryNorm(_STEPS, 256, extend="max"), "auto" if narrow else "equal"
+    shown = axis.imshow(separation, norm=norm, cmap="RdYlBu", aspect=aspect)
     gap = "\n" if narrow else " "
     numbers = [str(k + 1) for k in range(count)]  # below a narrow figure, where names would take half of it
     rows = [f"{name}  {number}" for name, number in zip(names, numbers, strict=True)] if narrow else names
-    axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=SMALL)
-    axis.set_yticks(range(count), rows, fontsize=SMALL)
+    axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=style.SMALL)
+    axis.set_yticks(range(count), rows, fontsize=style.SMALL)
     axis.set(xlabel="could be mistaken for", ylabel="effect present\n(at its detection limit)")
     if omitted := len(found.effects) - count:
         axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all")
     label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
     if narrow:
-        colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)
+        style.colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)
     else:
-        colour_bar(figure, shown, axis, label)
+        style.colour_bar(figure, shown, axis, label)
     return figure

@@ -20,36 +20,12 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.text import two_digits, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.reports.style import (
-    ABOVE,
-    AFTER,
-    DIVERGING,
-    PAGE,
-    SEQUENTIAL,
-    SMALL,
-    AnyFigure,
-    Canvas,
-    Field,
-    angle_ticks,
-    colour_bar,
-    element_kind,
-    element_symbols,
-    field_axes,
-    largest_size,
-    matrix_panels,
-    outer_labels,
-    pixel_map,
-    plain,
-    plain_ticks,
-    point_map,
-    rounded_up,
-    styled,
-)
+from walop_jax.reports import style
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, Field, styled
 from walop_jax.science.field_accuracy import FieldAccuracy
 
 Parameters = Float[np.ndarray, " n"]  # full vectors
-FITTED = Normalize(0.7, 1.3)
-"""Scale of rms residuals of a fit that explains its data, the same for every run."""
+FITTED = Normalize(0.7, 1.3)  # scale of rms residuals of a fit that explains its data, the same for every run
 
 
 @styled
@@ -72,11 +48,11 @@ def calibration_figure(
     rows = max(2, maps.arms)
     figure, axes = on.panels(10.2, 2.35 * rows, rows, 4, turned=True)
     elements, shown = range(3 * maps.arms), axes[: maps.arms, :3]
-    matrix_panels(figure, shown, maps.values, field_of(maps), elements, smooth=True)
+    style.matrix_panels(figure, shown, maps.values, field_of(maps), elements, smooth=True)
     _before_and_after(figure, tuple(axes[:2, 3]), likelihood, before, values)
     for axis in (*axes[maps.arms :, :3].ravel(), *axes[2:, 3]):
         axis.remove()
-    outer_labels(axes)
+    style.outer_labels(axes)
     return figure
 
 
@@ -91,10 +67,10 @@ def _before_and_after(
         residual = point_residuals(likelihood, values)
         low, high = (float(edge(residual[shown])) for edge in (np.nanmin, np.nanmax))
         far = high > 3.0
-        field_axes(axis, title)
+        style.field_axes(axis, title)
         norm = Normalize(low, high) if far else FITTED
-        image = point_map(axis, points.x, points.y, residual, norm, "magma_r", shown)
-        colour_bar(figure, image, axis, "rms residual (σ)", extend="neither" if far else "both")
+        image = style.point_map(axis, points.x, points.y, residual, norm, "magma_r", shown)
+        style.colour_bar(figure, image, axis, "rms residual (σ)", extend="neither" if far else "both")
 
 
 def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndarray, " p"]:
@@ -122,7 +98,7 @@ def _histogram(axis: Axes, likelihood: Likelihood, values: Parameters) -> None:
     beyond = float(np.mean(np.abs(used / width) > edges[-1]))
     if beyond > 0:
         tail = f"{two_digits(100.0 * beyond)} % beyond ±{edges[-1]:g}"
-        axis.text(0.03, 0.97, tail, transform=axis.transAxes, va="top", fontsize=SMALL)
+        axis.text(0.03, 0.97, tail, transform=axis.transAxes, va="top", fontsize=style.SMALL)
     t = np.linspace(-4.0, 4.0, 201)
     axis.plot(t, np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi), color="C3", lw=1.2, label="noise alone")
     axis.set(xlabel="residual / its expected width", ylabel="density")
@@ -161,20 +137,20 @@ def modulation_figure(
             signal = (first - second) / (first + second)
             axis.plot(e.clp_angle[rows], signal, "os^Dv"[k % 5], ms=4, label=where)
         axis.set(xlabel="polariser angle (deg)", ylabel=name)
-        angle_ticks(axis.xaxis, figure, arms)
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc=ABOVE)
+        style.angle_ticks(axis.xaxis, figure, arms)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc=style.ABOVE)
     return figure
 
 
 @styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
     """The elements of the matrix over the field; `kind`: those of one name in Paper II (place in `PAPER_NAMES`)."""
-    chosen = [i for i in range(len(maps.values)) if kind in (None, element_kind(i, maps.arms))]
+    chosen = [i for i in range(len(maps.values)) if kind in (None, style.element_kind(i, maps.arms))]
     rows = maps.arms if kind is None else 1
     columns = max(len(chosen) // rows, 1)
     size = ((2.9 if rows > 1 else 4.0) * columns, 2.65 * rows + 0.7 * (rows == 1))
     figure, axes = on.panels(*size, rows, columns, turned=True, squeeze=False)
-    matrix_panels(figure, axes, maps.values, field_of(maps), chosen)
+    style.matrix_panels(figure, axes, maps.values, field_of(maps), chosen)
     return figure
 
 
@@ -185,13 +161,13 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     low, high = (100.0 * float(edge(maps.errors[maps.errors > 0], initial=1e-6)) for edge in (np.min, np.max))
     high = 10.0 ** np.ceil(np.log10(high))
     low = max(10.0 ** np.floor(np.log10(low)), high / 1e4)
-    image = None
-    for axis, errors, name in zip(axes.ravel(), maps.errors, element_symbols(maps.arms), strict=True):
-        least, highest = (plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
-        field_axes(axis, f"error of {name}\n{least}–{highest} %")
-        image = pixel_map(axis, 100.0 * errors, field_of(maps), LogNorm(low, max(high, 10 * low)), SEQUENTIAL)
-    colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
-    outer_labels(axes)
+    norm, image = LogNorm(low, max(high, 10 * low)), None
+    for axis, errors, name in zip(axes.ravel(), maps.errors, style.element_symbols(maps.arms), strict=True):
+        least, highest = (style.plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
+        style.field_axes(axis, f"error of {name}\n{least}–{highest} %")
+        image = style.pixel_map(axis, 100.0 * errors, field_of(maps), norm, style.SEQUENTIAL)
+    style.colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
+    style.outer_labels(axes)
     return figure
 
 
@@ -201,14 +177,16 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) ->
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
-    kinds = [element_kind(i, new.arms) for i in range(len(change))]
+    kinds = [style.element_kind(i, new.arms) for i in range(len(change))]
     figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, turned=True, squeeze=False)
-    for axis, values, name, kind in zip(axes.ravel(), change, element_symbols(new.arms), kinds, strict=True):
-        far = rounded_up(largest_size(change[np.equal(kinds, kind)]))
-        field_axes(axis, f"change of {name}")
-        image = pixel_map(axis, values, field_of(new), Normalize(-far, far), DIVERGING)
-        colour_bar(figure, image, axis, "new − old (%)" if axis in axes[:, -1] else "")
-    outer_labels(axes)
+    for axis, values, name, kind in zip(
+        axes.ravel(), change, style.element_symbols(new.arms), kinds, strict=True
+    ):
+        far = style.rounded_up(style.largest_size(change[np.equal(kinds, kind)]))
+        style.field_axes(axis, f"change of {name}")
+        image = style.pixel_map(axis, values, field_of(new), Normalize(-far, far), style.DIVERGING)
+        style.colour_bar(figure, image, axis, "new − old (%)" if axis in axes[:, -1] else "")
+    style.outer_labels(axes)
     return figure
 
 
@@ -224,20 +202,20 @@ def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canv
     figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, turned=True, squeeze=False)
 
     def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
-        field_axes(axis, title)
-        colour_bar(figure, pixel_map(axis, values, field_of(residuals), norm, colours), axis)
+        style.field_axes(axis, title)
+        style.colour_bar(figure, style.pixel_map(axis, values, field_of(residuals), norm, colours), axis)
 
     far = 100.0 * _almost_largest(elements)
-    for axis, values, name in zip(axes[:, :3].ravel(), elements, element_symbols(arms), strict=True):
-        draw(axis, f"$\\delta${name} (%)", 100.0 * values, Normalize(-far, far), DIVERGING)
+    for axis, values, name in zip(axes[:, :3].ravel(), elements, style.element_symbols(arms), strict=True):
+        draw(axis, f"$\\delta${name} (%)", 100.0 * values, Normalize(-far, far), style.DIVERGING)
     low, high = float(np.nanmin(residuals.chi2)), _almost_largest(residuals.chi2)
-    draw(axes[-1, 3], "χ²/dof", residuals.chi2, Normalize(low, high), SEQUENTIAL)
+    draw(axes[-1, 3], "χ²/dof", residuals.chi2, Normalize(low, high), style.SEQUENTIAL)
     # The panels above that of χ² are free for the arms after the first.
     for arm, (axis, ratio) in enumerate(zip(axes[:-1, 3], ratios, strict=True), start=1):
         far = 100.0 * _almost_largest(ratio)
         title = f"{cameras[2 * arm]}, {cameras[2 * arm + 1]} / {cameras[0]}, {cameras[1]} (%)"
-        draw(axis, title, 100.0 * ratio, Normalize(-far, far), DIVERGING)
-    outer_labels(axes)
+        draw(axis, title, 100.0 * ratio, Normalize(-far, far), style.DIVERGING)
+    style.outer_labels(axes)
     return figure
 
 
@@ -262,23 +240,23 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))
     low, high = float(percent.min()), float(percent.max())
-    field_axes(left, f"error of p (%), {accuracy.filter}")
+    style.field_axes(left, f"error of p (%), {accuracy.filter}")
     norm = LogNorm(0.003, _RANGE[1])
-    image = pixel_map(left, percent, accuracy.extent, norm, SEQUENTIAL, smooth=True)
-    colour_bar(figure, image, left, extend="both")
+    image = style.pixel_map(left, percent, accuracy.extent, norm, style.SEQUENTIAL, smooth=True)
+    style.colour_bar(figure, image, left, extend="both")
     if low < goal < high:
         fine = 10.0 ** zoom(np.log10(percent), 4, order=1)
         left.contour(fine, [goal], extent=accuracy.extent, colors="w", linewidths=1.2)
     edges = np.geomspace(0.8 * low, 1.25 * high, 37)
     share = np.full(percent.size, 100.0 / percent.size)
-    right.hist(percent.ravel(), edges.tolist(), weights=share, color=AFTER)
+    right.hist(percent.ravel(), edges.tolist(), weights=share, color=style.AFTER)
     right.axvline(goal, color="0.3", lw=1.0, ls="--")
     right.text(
-        goal, 1.01, f"goal {goal:.3g} %", fontsize=SMALL, transform=right.get_xaxis_transform(), ha="center",
+        goal, 1.01, f"goal {goal:.3g} %", fontsize=style.SMALL, transform=right.get_xaxis_transform(), ha="center",
         va="bottom",
     )  # fmt: skip
     right.set(xscale="log", xlim=(edges[0], max(edges[-1], 1.5 * goal)))
-    plain_ticks(right.xaxis)
+    style.plain_ticks(right.xaxis)
     right.set(xlabel="error of p (%)", ylabel="share of the field (%)")
     return figure
 
@@ -297,11 +275,11 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
     lowest, highest = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
     highest = min(max(float(np.nanmax(maps[0])), highest), max(_RANGE[1], highest))
     for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):
-        field_axes(axis, f"error of p {title}")
+        style.field_axes(axis, f"error of p {title}")
         shown = np.minimum(values, highest)
-        image = point_map(axis, places[0], places[1], shown, LogNorm(lowest, highest), SEQUENTIAL)
+        image = style.point_map(axis, places[0], places[1], shown, LogNorm(lowest, highest), style.SEQUENTIAL)
         blind = np.isnan(values)
         axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
-    colour_bar(figure, image, axes, "error of p (%)", extend="max", pad=0.02)
-    outer_labels(axes)
+    style.colour_bar(figure, image, axes, "error of p (%)", extend="max", pad=0.02)
+    style.outer_labels(axes)
     return figure

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +12,12 @@ from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
-from walop_jax.reports import diagnosis_figures, figures, paper_figures, posterior_figures, survey_figures
+from walop_jax.reports import diagnosis_figures as diagnosis
+from walop_jax.reports import figures, posterior_figures, survey_figures
+from walop_jax.reports import paper_figures as paper
 from walop_jax.reports.run import COMPARISON, DATA, SURVEY, FigureSource
-from walop_jax.reports.style import PAGE, PLATES, AnyFigure
-from walop_jax.reports.wording import listed
+from walop_jax.reports.style import PAGE, PLATES, AnyFigure, texts
+from walop_jax.reports.wording import listed as in_words
 
 NARROW = 5.0  # inches of a corner plot: three coefficients at most
 
@@ -73,13 +74,9 @@ def _corner(source: FigureSource) -> AnyFigure:
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
     draws = np.stack([held[name].ravel() for name in shown], axis=1)
-    size = {}
-    if source.canvas.figsize is not None:
-        size["width"] = source.canvas.figsize[0]
-    if source.canvas.width is not None:
-        size["width"] = source.canvas.width
-    texts = [units[name] for name in shown]
-    return posterior_figures.corner_figure(draws, shown, texts, source.reference, **size)
+    size = source.canvas.width or (source.canvas.figsize or (posterior_figures.CORNER,))[0]
+    in_units = [units[name] for name in shown]
+    return posterior_figures.corner_figure(draws, shown, in_units, source.reference, size)
 
 
 def _trace(source: FigureSource) -> AnyFigure:
@@ -90,8 +87,14 @@ def _trace(source: FigureSource) -> AnyFigure:
     if sample is not None and set(shown) <= set(sample.sampled):  # the walkers, not the draws
         column = [sample.sampled.index(name) for name in shown]
         chains, steps, tau = sample.chains[..., column], sample.thin, sample.convergence.tau[column]
-    texts = [units[name] for name in shown]
-    return posterior_figures.trace_figure(chains, shown, texts, steps, tau, source.canvas)
+    in_units = [units[name] for name in shown]
+    return posterior_figures.trace_figure(chains, shown, in_units, steps, tau, source.canvas)
+
+
+def _signature(source: FigureSource) -> AnyFigure:
+    data = source.figure_data
+    shown = data.comparisons[source.examined], data.exposures, data.cameras
+    return diagnosis.signature_figure(*shown, source.canvas)
 
 
 def _cameras(source: FigureSource) -> tuple[str, ...] | None:
@@ -111,14 +114,12 @@ def _modulation(source: FigureSource) -> AnyFigure:
     return figures.modulation_figure(source.calset, nearest, source.canvas, _cameras(source))
 
 
-@dataclasses.dataclass(frozen=True)
-class NamedFigure:
-    """A figure with a line about it, the file of a run that it needs, and whether a run can give it."""
+class NamedFigure(NamedTuple):
+    """A figure, the file of a run that it needs, and whether a run can give it; lines about them: `figures.toml`."""
 
-    about: str
     draw: Callable[[FigureSource], AnyFigure]
     needs: str = PRODUCT
-    possible: Callable[[FigureSource], bool] = lambda source: True
+    possible: Callable[[FigureSource], object] = lambda source: True
 
 
 def _small(source: FigureSource) -> bool:
@@ -145,95 +146,38 @@ def _angles(fewest: int) -> Callable[[FigureSource], bool]:
 
 
 FIGURES: Mapping[str, NamedFigure] = {
-    "accuracy": NamedFigure(
-        "error of p over the field: map and histogram", _accuracy, possible=lambda s: s.maps.arms > 1
-    ),
-    "calibration": NamedFigure(
-        "the instrument matrix, and residuals before and after the fit",
-        lambda s: _residuals(s, whole=True),
-        possible=_small,
-    ),
-    "matrix": NamedFigure(
-        "the elements of the instrument matrix", lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas)
-    ),
-    "matrix-errors": NamedFigure(
-        "their standard errors", lambda s: figures.matrix_errors_figure(s.maps, s.canvas)
-    ),
-    "zero-offset": NamedFigure(
-        "maps of m21 and m31", lambda s: figures.matrix_maps_figure(s.maps, 0, s.canvas)
-    ),
-    "efficiency": NamedFigure(
-        "maps of m22 and m33", lambda s: figures.matrix_maps_figure(s.maps, 1, s.canvas)
-    ),
-    "cross-talk": NamedFigure(
-        "maps of m23 and m32", lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)
-    ),
-    "retardance": NamedFigure(
-        "maps of the retardance of the half-wave plates",
-        lambda s: paper_figures.retardance_figure(s.rebuilt, on=s.canvas),
-        possible=lambda s: bool(_plates(s)),
-    ),
+    "accuracy": NamedFigure(_accuracy, possible=lambda s: s.maps.arms > 1),
+    "calibration": NamedFigure(lambda s: _residuals(s, whole=True), possible=_small),
+    "matrix": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas)),
+    "matrix-errors": NamedFigure(lambda s: figures.matrix_errors_figure(s.maps, s.canvas)),
+    "zero-offset": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 0, s.canvas)),
+    "efficiency": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 1, s.canvas)),
+    "cross-talk": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)),
+    "retardance": NamedFigure(lambda s: paper.retardance_figure(s.rebuilt, s.canvas), possible=_plates),
     "retardance-wavelength": NamedFigure(
-        "their retardance against wavelength",
-        lambda s: paper_figures.retardance_wavelength_figure(s.rebuilt, on=s.canvas),
-        possible=lambda s: bool(_plates(s)),
+        lambda s: paper.retardance_wavelength_figure(s.rebuilt, s.canvas), possible=_plates
     ),
     "coefficients": NamedFigure(
-        "maps of the coefficients of the method of Paper II",
-        lambda s: paper_figures.coefficients_figure(s.calset, s.maps.filter, s.canvas),
-        possible=_angles(len(TERMS)),
+        lambda s: paper.coefficients_figure(s.calset, s.maps.filter, s.canvas), possible=_angles(len(TERMS))
     ),
     "transmission": NamedFigure(
-        "transmission of the cameras against polariser angle, with residuals",
-        lambda s: paper_figures.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
+        lambda s: paper.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
         possible=_angles(3),
     ),
-    "modulation": NamedFigure("q_m and u_m against polariser angle", _modulation, possible=_angles(1)),
-    "protection": NamedFigure(
-        "largest error of q and u that an effect can make undetected",
-        lambda s: diagnosis_figures.protection_figure(s.limits, s.canvas),
-        LIMITS,
-    ),
-    "separation": NamedFigure(
-        "which effects look alike", lambda s: diagnosis_figures.separation_figure(s.limits, s.canvas), LIMITS
-    ),
-    "ladder": NamedFigure(
-        "χ² of the starting model and of every model after it",
-        lambda s: diagnosis_figures.ladder_figure(s.figure_data.ladder, s.canvas),
-        FIGURE_DATA,
-    ),
+    "modulation": NamedFigure(_modulation, possible=_angles(1)),
+    "protection": NamedFigure(lambda s: diagnosis.protection_figure(s.limits, s.canvas), LIMITS),
+    "separation": NamedFigure(lambda s: diagnosis.separation_figure(s.limits, s.canvas), LIMITS),
+    "ladder": NamedFigure(lambda s: diagnosis.ladder_figure(s.figure_data.ladder, s.canvas), FIGURE_DATA),
     "effect": NamedFigure(
-        "residuals over the field without and with an effect that was found",
-        lambda s: diagnosis_figures.effect_figure(s.figure_data, s.examined, s.canvas),
-        FIGURE_DATA,
+        lambda s: diagnosis.effect_figure(s.figure_data, s.examined, s.canvas), FIGURE_DATA
     ),
-    "signature": NamedFigure(
-        "residuals of every exposure, and the part explained by the effect",
-        lambda s: diagnosis_figures.signature_figure(
-            s.figure_data.comparisons[s.examined], s.figure_data.exposures, s.figure_data.cameras, s.canvas
-        ),
-        FIGURE_DATA,
-    ),
-    "rms": NamedFigure(
-        "rms residuals over the field, of the starting and the final model",
-        lambda s: diagnosis_figures.rms_figure(s.figure_data, s.canvas),
-        FIGURE_DATA,
-    ),
-    "shares": NamedFigure(
-        "residuals by camera, kind, filter and exposure",
-        lambda s: diagnosis_figures.shares_figure(s.figure_data.shares, s.canvas),
-        FIGURE_DATA,
-    ),
-    "residual-map": NamedFigure(
-        "residuals of the smooth model, of whole frames", _residual_map, possible=lambda s: not _small(s)
-    ),
-    "residuals": NamedFigure(
-        "residuals of every field point before and after the fit, and all of them",
-        _residuals,
-        possible=_small,
-    ),
-    "corner": NamedFigure("posterior of coefficients in pairs", _corner, POSTERIOR),
-    "trace": NamedFigure("chains of the posterior", _trace, POSTERIOR),
+    "signature": NamedFigure(_signature, FIGURE_DATA),
+    "rms": NamedFigure(lambda s: diagnosis.rms_figure(s.figure_data, s.canvas), FIGURE_DATA),
+    "shares": NamedFigure(lambda s: diagnosis.shares_figure(s.figure_data.shares, s.canvas), FIGURE_DATA),
+    "residual-map": NamedFigure(_residual_map, possible=lambda s: not _small(s)),
+    "residuals": NamedFigure(_residuals, possible=_small),
+    "corner": NamedFigure(_corner, POSTERIOR),
+    "trace": NamedFigure(_trace, POSTERIOR),
 }
 """In the order of the list that is printed."""
 
@@ -247,40 +191,29 @@ def _tracks(source: FigureSource) -> AnyFigure:
 
 
 OF_RESULTS: Mapping[str, NamedFigure] = {
-    "modulation": NamedFigure(
-        FIGURES["modulation"].about, _modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())
-    ),
-    **{
-        name: NamedFigure(about, lambda s, draw=figure: draw(s.held[COMPARISON]), COMPARISON)
-        for name, about, figure in (
-            ("histogram", "errors of both methods", paper_figures.histogram_figure),
-            ("map", "their errors of p over the field", paper_figures.map_figure),
-            ("offset", "corrections of the published method", paper_figures.offset_figure),
-            ("spectral", "the matrix against wavelength", paper_figures.spectral_figure),
-        )
-    },
+    "modulation": NamedFigure(_modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())),
+    "histogram": NamedFigure(lambda s: paper.histogram_figure(s.held[COMPARISON]), COMPARISON),
+    "map": NamedFigure(lambda s: paper.map_figure(s.held[COMPARISON]), COMPARISON),
+    "offset": NamedFigure(lambda s: paper.offset_figure(s.held[COMPARISON]), COMPARISON),
+    "spectral": NamedFigure(lambda s: paper.spectral_figure(s.held[COMPARISON]), COMPARISON),
     "plate": NamedFigure(
-        "photon errors with the calibration plate",
-        lambda s: paper_figures.plate_figure(s.rebuilt),
+        lambda s: paper.plate_figure(s.rebuilt),
         possible=lambda s: CALIBRATION_PLATE in s.rebuilt.model.template.patched().moving(),
     ),
-    "tracks": NamedFigure("parameters against time", _tracks, SURVEY),
-    "nights": NamedFigure(
-        "χ² of every night", lambda s: survey_figures.nights_figure(s.held[SURVEY].document()), SURVEY
-    ),
+    "tracks": NamedFigure(_tracks, SURVEY),
+    "nights": NamedFigure(lambda s: survey_figures.nights_figure(s.held[SURVEY].document()), SURVEY),
 }
 """Figures of results in memory; those that runs do not have are of one size."""
 
 
-def possible(source: FigureSource) -> dict[str, NamedFigure]:
-    """The figures that a run, or a result in memory, can give; its plates go by their names."""
-    known = FIGURES if source.run is not None else {**FIGURES, **OF_RESULTS}
-    in_source = {name: entry for name, entry in known.items() if entry.needs in source}
-    figures = {name: entry for name, entry in in_source.items() if entry.possible(source)}
-    if "retardance" in figures:
-        about = f"maps of the retardance of {listed(_plates(source))}"
-        figures["retardance"] = dataclasses.replace(figures["retardance"], about=about)
-    return figures
+def possible(source: FigureSource) -> dict[str, str]:
+    """The figures that a run, or a result in memory, can give, with a line about each; its plates by their names."""
+    every = FIGURES if source.run is not None else {**FIGURES, **OF_RESULTS}
+    in_source = {name: entry for name, entry in every.items() if entry.needs in source}
+    listed = {name: texts("figures")[name] for name, entry in in_source.items() if entry.possible(source)}
+    if "retardance" in listed:
+        listed["retardance"] = f"maps of the retardance of {in_words(_plates(source))}"
+    return listed
 
 
 def draw(name: str, source: FigureSource) -> AnyFigure:

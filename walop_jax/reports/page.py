@@ -33,14 +33,13 @@ from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.run import FigureSource, RunContents, read_limits
 from walop_jax.reports.style import PAGE, TEMPLATES, WIDTHS, Canvas, texts
 from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
-from walop_jax.science.commissioning import is_go, requirement_advice, requirement_rows, requirements
+from walop_jax.science.commissioning import Certificate, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 MANY = 32  # rows of a table above which it is folded
-SMALL = ("ladder", "protection")
-"""Figures that take half of the width."""
+SMALL = ("ladder", "protection")  # figures that take half of the width
 
 
 NARROW = Canvas(width=WIDTHS["column"] / 25.4)
@@ -90,16 +89,13 @@ def display_of(document: Mapping[str, Any], path: Path) -> Display:
 
 def filled(head: Display, sections: Iterable[Section], *, good: bool, **content: Any) -> str:
     """The text of a page; no line ends between a number and its sign or unit."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options: dict[str, Any] = {"autoescape": True, "undefined": jinja2.StrictUndefined}
+    options |= {"trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **options)
     environment.filters |= {"unit": unit_in_words, "signed": signed}
     filled_sections = [section for section in sections if not section.empty]
-    defaults = {"doubts": (), "next": (), "versions": {}, "many": MANY, "instrument": "", "missing": ()}
+    defaults = {**dict.fromkeys(("about", "first", "instrument"), ""), "versions": {}, "many": MANY}
+    defaults |= dict.fromkeys(("doubts", "next", "missing"), ())
     content = defaults | content | {"head": head, "sections": filled_sections, "good": good}
     text = environment.get_template("page.html").render(content)
     return re.sub(r"(?<=\d) (?=[%σ±])|(?<=[=±≤]) (?=\d)", "\N{NO-BREAK SPACE}", text)
@@ -202,10 +198,9 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
     if run.product is None or accuracy is None:
         return None, True
     checks = requirements(run.product.verdict, "", accuracy, None)
-    all_met = all(check.met for check in checks)
-    title = "No go" if not is_go(checks) else "Go: fit for use" if all_met else "Go, with reservations"
-    rows, advice = requirement_rows(checks), requirement_advice(checks)
-    return Display(title, head=("", "requirement", "result"), rows=rows, notes=advice), is_go(checks)
+    judged = Certificate(run.source.folder, (), checks)
+    title = "Go, with reservations" if judged.missing else "Go: fit for use"
+    return dataclasses.replace(judged.display(), title=title if judged.go else "No go"), judged.go
 
 
 def _accuracy(run: RunContents) -> FieldAccuracy | None:
@@ -276,10 +271,8 @@ def _diagnosed(run: RunContents, head: Display, missing: list[str]) -> list[Sect
     patterns = [] if not leftover else leftover.get("patterns", [])
     rows = tuple((row["pattern"], probability(row["p_value"]).removeprefix("= ")) for row in patterns)
     shown = dataclasses.replace(head, facts=())
-    return [
-        Section("found", "Findings", shown, pictures),
-        Section("unexplained", "Unexplained patterns", Display("", head=("pattern", ">p"), rows=rows)),
-    ]
+    left = Section("unexplained", "Unexplained patterns", Display("", head=("pattern", ">p"), rows=rows))
+    return [Section("found", "Findings", shown, pictures), left]
 
 
 def _candidates(run: RunContents) -> Section:
@@ -296,14 +289,10 @@ def _candidates(run: RunContents) -> Section:
     for row in run.diagnosis.get("limits", ()):
         texts = value_and_error(row["value"], row["sigma"])
         limits += ((row["effect"], row["parameter"], *texts, rounded(row["below_95"], ".2g"), row["unit"]),)
-    title = (
-        f"{len(limits)} amplitudes that were not found, with the size they stay below with 95 % probability"
-    )
+    title = "amplitudes that were not found, with the size they stay below with 95 % probability"
     head = ("effect", "parameter", ">value", ">σ", ">below (95 %)", "unit")
-    folded = (
-        Display(f"{len(hidden_rows)} more", head=table.head, rows=hidden_rows),
-        Display(title, head=head, rows=limits),
-    )
+    more = Display(f"{len(hidden_rows)} more", head=table.head, rows=hidden_rows)
+    folded = (more, Display(f"{len(limits)} {title}", head=head, rows=limits))
     text = "Every effect of the catalogue at the first look at the starting model; p is corrected for their number."
     folded = [display for display in folded if display.rows]
     return Section("candidates", "Candidates", table, folded=folded, text=text)
@@ -411,18 +400,17 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     limited = kind == "plan" and (folder / LIMITS).exists()
     limits = read_limits(folder / LIMITS).display() if limited else None
     good = bool(document.get(page.get("trust"), True)) and bool(document.get("new_trusted", True))
+    sections = (
+        Section("figures", "Figures", pictures=pictures),
+        Section("numbers", "In numbers", dataclasses.replace(head, facts=())),
+        Section("limits", "Limits of the plan", limits),
+    )
     text = filled(
         head,
-        (
-            Section("figures", "Figures", pictures=pictures),
-            Section("numbers", "In numbers", dataclasses.replace(head, facts=())),
-            Section("limits", "Limits of the plan", limits),
-        ),
+        sections,
         good=good,
         untrusted=not document.get("trusted", document.get("new_trusted", True)),
         title=page["title"],
-        about="",
-        first="",
         doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
         name=folder.resolve().name,
         next=page.get("next", ()),

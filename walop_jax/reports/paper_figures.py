@@ -22,25 +22,8 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances
-from walop_jax.reports.style import (
-    ABOVE,
-    DIVERGING,
-    FONT,
-    PAGE,
-    PLATES,
-    SEQUENTIAL,
-    SMALL,
-    AnyFigure,
-    Canvas,
-    angle_ticks,
-    colour_bar,
-    field_axes,
-    outer_labels,
-    pixel_map,
-    plain_ticks,
-    point_map,
-    styled,
-)
+from walop_jax.reports import style
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
 Places = Float[np.ndarray, " p"]
@@ -62,20 +45,16 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
         along = np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0)
         smooth = np.unwrap(along, axis=0, period=360.0)
         smooth -= 360.0 * np.floor(smooth[_PIXELS // 2, _PIXELS // 2] / 360.0)
-        field_axes(axis, f"{PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
+        style.field_axes(axis, f"{style.PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
         norm = Normalize(float(smooth.min()), float(smooth.max()))
         label = "retardance (deg)" if axis is axes[0, -1] else ""
-        colour_bar(figure, pixel_map(axis, smooth, calibration.field, norm, SEQUENTIAL), axis, label)
-        lines = axis.contour(
-            smooth,
-            extent=calibration.field,
-            levels=6,
-            colors="w",
-            linewidths=0.5,
-            negative_linestyles="solid",
+        style.colour_bar(
+            figure, style.pixel_map(axis, smooth, calibration.field, norm, style.SEQUENTIAL), axis, label
         )
-        axis.clabel(lines, fontsize=SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
-    outer_labels(axes)
+        look = {"colors": "w", "linewidths": 0.5, "negative_linestyles": "solid"}
+        lines = axis.contour(smooth, extent=calibration.field, levels=6, **look)
+        axis.clabel(lines, fontsize=style.SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
+    style.outer_labels(axes)
     return figure
 
 
@@ -94,11 +73,11 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     figure, axes = on.panels(3.9 * len(names), 3.5, 1, len(names), squeeze=False)
     for name, axis, curves in zip(names, axes[0], retardances, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
-            style = ("-", "--", "-.", ":", (0, (4, 4)))[n]
-            axis.plot(1e3 * line, curve, linestyle=style, color=f"C{n}", lw=1.3, label=place)
-        axis.set(title=PLATES.get(name, name), xlabel="wavelength (nm)")
+            dashes = ("-", "--", "-.", ":", (0, (4, 4)))[n]
+            axis.plot(1e3 * line, curve, linestyle=dashes, color=f"C{n}", lw=1.3, label=place)
+        axis.set(title=style.PLATES.get(name, name), xlabel="wavelength (nm)")
     axes[0, 0].set_ylabel("retardance (deg)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc=ABOVE)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc=style.ABOVE)
     return figure
 
 
@@ -114,9 +93,8 @@ def _unwrapped_retardances(
     along = [(v[0] + steps * (v - v[0])).ravel() for v in (x, y)]
     lines = np.append(_WAVELENGTH, line)
     retardances = plate_retardances(instrument, lines, *along).reshape(-1, _STEPS, len(x), len(lines))
-    at_reference = np.unwrap(retardances[..., 0], axis=1, period=360.0)[:, -1] - 360.0 * np.floor(
-        retardances[:, :1, 0, 0] / 360.0
-    )
+    turns = np.floor(retardances[:, :1, 0, 0] / 360.0)
+    at_reference = np.unwrap(retardances[..., 0], axis=1, period=360.0)[:, -1] - 360.0 * turns
     curves = np.unwrap(retardances[:, -1, :, 1:], axis=-1, period=360.0)
     near = int(np.argmin(np.abs(line - _WAVELENGTH)))
     jump = curves[..., near] - at_reference
@@ -130,23 +108,19 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
     figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
-            field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
-            low, high = _most(values)  # where an exposure holds no u a few are larger by orders of magnitude
+            style.field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
+            # Where an exposure holds no u a few are larger by orders of magnitude.
+            median = float(np.median(values))
+            spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0
+            low, high = max(float(values.min()), median - spread), min(float(values.max()), median + spread)
             both_signs = low < 0 < high
             if both_signs:
                 low, high = -max(-low, high), max(-low, high)
-            colours = DIVERGING if both_signs else SEQUENTIAL
-            shown = point_map(axis, fits.x, fits.y, values, Normalize(low, high), colours)
-            colour_bar(figure, shown, axis, extend="both")
-    outer_labels(axes)
+            colours = style.DIVERGING if both_signs else style.SEQUENTIAL
+            shown = style.point_map(axis, fits.x, fits.y, values, Normalize(low, high), colours)
+            style.colour_bar(figure, shown, axis, extend="both")
+    style.outer_labels(axes)
     return figure
-
-
-def _most(values: Places) -> tuple[float, float]:
-    """The range of the values without those more than five (robust) standard deviations from their median."""
-    median = float(np.median(values))
-    spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0
-    return max(float(values.min()), median - spread), min(float(values.max()), median + spread)
 
 
 @styled
@@ -180,16 +154,15 @@ def transmission_figure(
         above.plot(fine, curve[:, k] / curve.sum(axis=1), color=f"C{k}", lw=1.0)
         above.plot(angle, counts[:, k] / total[:, 0], "osD^"[k % 4], color=f"C{k}", ms=4, label=names[k])
         residual = 100.0 * (counts[:, k] / total[:, 0] - fitted[:, k] / fitted.sum(axis=1))
-        below.errorbar(
-            angle, residual, 100.0 * sigma[:, k] / total[:, 0], fmt="osD^"[k % 4], ms=3, color=f"C{k}", lw=0.8
-        )
+        error, look = 100.0 * sigma[:, k] / total[:, 0], {"fmt": "osD^"[k % 4], "color": f"C{k}"}
+        below.errorbar(angle, residual, error, ms=3, lw=0.8, **look)
     below.axhline(0.0, color="0.6", lw=0.8)
     where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
     above.set_title(f"{where}, {filter_name}", loc="left")
     above.set_ylabel("share of the light")
     below.set(xlabel="polariser angle (deg)", ylabel="residual (%)")
-    figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=ABOVE)
-    angle_ticks(below.xaxis, figure, 1)
+    figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=style.ABOVE)
+    style.angle_ticks(below.xaxis, figure, 1)
     return figure
 
 
@@ -205,16 +178,15 @@ def histogram_figure(comparison: Comparison) -> Figure:
     """Distribution over the field of the errors of q, u and p: on the grid points above, between them below."""
     figure, axes = PAGE.panels(9.6, 4.8, 2, 3, sharex=True, sharey="row")
     bins = np.geomspace(*_RANGE, 33)
-    for row, (place, title) in zip(
-        axes, ((comparison.grid, "on grid points"), (comparison.between, "between them")), strict=True
-    ):
+    places = (comparison.grid, "on grid points"), (comparison.between, "between them")
+    for row, (place, title) in zip(axes, places, strict=True):
         for axis, k in zip(row, range(3), strict=True):
             for method in ("paper", "joint"):
                 values = np.clip(100 * getattr(place, method)[:, k], *_RANGE)
                 axis.hist(values, bins, histtype="step", color=_COLOURS[method], label=_NAMES[method], lw=1.5)
             axis.axvline(100 * GOAL, color="0.5", lw=0.8, ls=":", label="goal 0.1 %")
             axis.set(xscale="log", title=f"{QUANTITIES[k]}, {title}")
-            plain_ticks(axis.xaxis)
+            style.plain_ticks(axis.xaxis)
         row[0].set_ylabel("field points")
     for axis in axes[1]:
         axis.set_xlabel("rms error (%); the end bins hold all beyond")
@@ -231,11 +203,11 @@ def map_figure(comparison: Comparison) -> Figure:
         panels = [(place, m) for place in (comparison.grid, comparison.between) for m in ("paper", "joint")]
         for axis, (place, method) in zip(row, panels, strict=True):
             where = "on the grid" if place is comparison.grid else "between"
-            field_axes(axis, f"{QUANTITIES[k]}, {_NAMES[method].partition(',')[0]}, {where}")
+            style.field_axes(axis, f"{QUANTITIES[k]}, {_NAMES[method].partition(',')[0]}, {where}")
             percent = 100 * getattr(place, method)[:, k]
-            shown = point_map(axis, place.x, place.y, percent, LogNorm(2e-3, 2.0), SEQUENTIAL)
-    outer_labels(axes)
-    colour_bar(figure, shown, axes, "rms error (%)", pad=0.01, shrink=0.8, extend="both")
+            shown = style.point_map(axis, place.x, place.y, percent, LogNorm(2e-3, 2.0), style.SEQUENTIAL)
+    style.outer_labels(axes)
+    style.colour_bar(figure, shown, axes, "rms error (%)", pad=0.01, shrink=0.8, extend="both")
     return figure
 
 
@@ -245,12 +217,10 @@ def offset_figure(comparison: Comparison) -> Figure:
     offsets = comparison.offsets
     figure, (left, middle, right) = PAGE.panels(9.6, 3.2, 1, 3)
     for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):
-        for along, label, color in (
-            (offsets.along, "one", "tab:orange"),
-            (offsets.along_three, "three", "tab:blue"),
-        ):
+        of_both = (offsets.along, "one", "tab:orange"), (offsets.along_three, "three", "tab:blue")
+        for along, label, color in of_both:
             axis.plot(100 * along[:, c], 100 * offsets.found[:, c], ".", ms=4, color=color, label=label)
-        axis.legend(title="directions", title_fontsize=SMALL)
+        axis.legend(title="directions", title_fontsize=style.SMALL)
         edge = 105 * np.abs(offsets.found[:, c]).max()
         axis.plot([-edge, edge], [-edge, edge], color="0.6", lw=0.8)
         words = f"Δ{name} from the weakest directions (%)", f"Δ{name} fitted as in Paper II (%)"
@@ -260,8 +230,8 @@ def offset_figure(comparison: Comparison) -> Figure:
         sizes = [np.sqrt(np.mean(v[:, c] ** 2)) for v in (offsets.found, offsets.noiseless, offsets.anchored)]
         right.bar(np.arange(3) + shift, 100 * np.array(sizes), 0.28, label=f"Δ{name}")
     right.set(yscale="log", ylabel="rms over the grid (%)")
-    right.set_xticks(range(3), labels, fontsize=SMALL)
-    right.legend(fontsize=FONT)
+    right.set_xticks(range(3), labels, fontsize=style.SMALL)
+    right.legend(fontsize=style.FONT)
     return figure
 
 
@@ -273,7 +243,7 @@ def spectral_figure(comparison: Comparison) -> Figure:
     for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
         left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
     left.set(xlabel="wavelength (nm)", title="at the corner of the field where colour matters most")
-    left.legend(fontsize=FONT)
+    left.legend(fontsize=style.FONT)
     spread = np.clip(100 * comparison.colours, 1e-5, None)
     bins = np.geomspace(spread.min() * 0.9, spread.max() * 1.1, 30)
     for c, name in ((0, r"$\Delta q_m$"), (1, r"$\Delta u_m$")):
@@ -281,7 +251,7 @@ def spectral_figure(comparison: Comparison) -> Figure:
     right.axvline(0.05, color="0.5", ls=":", lw=0.8)
     colour = "largest change with the colour of a star, p = 1 % (%)"
     right.set(xscale="log", xlabel=colour, ylabel="grid points")
-    right.legend(fontsize=FONT)
+    right.legend(fontsize=style.FONT)
     return figure
 
 
@@ -301,9 +271,9 @@ def plate_figure(
     for axis, plates in zip(axes[0], combinations, strict=True):
         settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
         worst = plate_errors(analysis, settings, x, y).reshape(_PLATE_PIXELS, _PLATE_PIXELS)
-        shown = pixel_map(axis, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
+        shown = style.pixel_map(axis, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
         names = ["out" if plate is None else f"{plate:g}°" for plate in plates]
-        field_axes(axis, "plate " + " and ".join(names))
-    outer_labels(axes)
-    colour_bar(figure, shown, axes, "error / ideal instrument", pad=0.02)
+        style.field_axes(axis, "plate " + " and ".join(names))
+    style.outer_labels(axes)
+    style.colour_bar(figure, shown, axes, "error / ideal instrument", pad=0.02)
     return figure

@@ -20,6 +20,7 @@ from walop_jax.reports.style import PAGE, SMALL, AnyFigure, Canvas, PaperFigure,
 SHARES = (0.393, 0.865)  # of the draws: inside 1 and 2 σ of a normal distribution of two coefficients
 BINS = 30  # of a histogram, along each axis
 MOST_IN_CORNER = 6  # coefficients whose axes can carry numbers
+CORNER = 7.1  # inches: two columns of A&A or ApJ
 PRIOR_ONLY = 0.9  # of the prior width: a wider posterior is a picture of the prior
 
 
@@ -77,12 +78,12 @@ def corner_figure(
     names: Sequence[str],
     units: Sequence[str],
     reference: Mapping[str, float] | None = None,
-    width: float = 7.1,
+    width: float = CORNER,
 ) -> Figure:
     """Histogram of every coefficient, and below the diagonal contours of every pair of them, drawn by `corner`.
 
     Contours hold 39 and 86 % of the draws, which is 1 and 2 σ of a normal distribution of two coefficients.
-    `reference` marks values by name (the fit, or a known truth). `width` in inches: 7.1 is two columns of A&A or ApJ.
+    `reference` marks values by name (the fit, or a known truth). `width` in inches.
     Median and half the 68 % interval stand above the diagonal; beyond six coefficients the axes carry no numbers.
     """
     with warnings.catch_warnings():

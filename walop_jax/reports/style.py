@@ -33,10 +33,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 FONT = 9
 SMALL = 7
 NARROW = 4.5  # inches: a column of print, or half a page
-PRINTED = 7
-"""Type (pt) of a figure of a given width: what journals ask for at least, at the size of print."""
-WIDTHS = {"column": 89.0, "page": 183.0}
-"""Widths (mm) of figures in journals, by name."""
+PRINTED = 7  # Type (pt) of a figure of a given width: what journals ask for at least, at the size of print
+WIDTHS = {"column": 89.0, "page": 183.0}  # widths (mm) of figures in journals, by name
 SHARED = ("sharex", "sharey")
 NARROWEST = 1.3  # inches of a panel of a given width: narrower ones go below each other
 NUMBER = 0.4  # inches of a number below an axis, with the gap to the next
@@ -59,8 +57,7 @@ Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
 Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
-AnyFigure = Any
-"""A figure on a `Canvas`, or the subfigure that took the room of axes."""
+AnyFigure = Any  # a figure on a `Canvas`, or the subfigure that took the room of axes
 
 
 @functools.cache

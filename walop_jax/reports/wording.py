@@ -51,14 +51,10 @@ def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]
         ("Field", with_minus_sign(f"X {low_x:+.2f} to {high_x:+.2f}°, Y {low_y:+.2f} to {high_y:+.2f}°")),
         ("Polariser angles", _angles(e.clp_angle[e.clp_in])),
     ]
-    rows += [
-        (
-            "Calibration plate" if prefix == CALIBRATION_PLATE else prefix,
-            _settings(p.angle[p.inside], bool((~p.inside).any())),
-        )
-        for prefix, p in e.positions.items()
-        if prefix != POLARISER
-    ]
+    for prefix, p in e.positions.items():
+        if prefix != POLARISER:
+            name = "Calibration plate" if prefix == CALIBRATION_PLATE else prefix
+            rows.append((name, _settings(p.angle[p.inside], bool((~p.inside).any()))))
     moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
     listed = some([str(name) for name in product.sources.name], _MANY)

@@ -24,8 +24,7 @@ from walop_jax.science.apply import Stars, results_of
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.sky.nights import night_of
 
-LIMIT = 0.5
-"""Standard errors; a result that is off by a quarter of its variance is made again."""
+LIMIT = 0.5  # standard errors; a result that is off by a quarter of its variance is made again
 MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
 
 
@@ -84,21 +83,16 @@ class Affected(Displayed):
 
     def display(self) -> Display:
         """A line for each night, and what must be made again."""
-        rows = tuple(
-            (
-                night.catalogue,
-                f"{night.night:.0f}" if np.isfinite(night.night) else "",
-                f"{night.stars}",
-                *map(two_digits, (night.median, night.most, night.largest)),
-                *(f"{100 * mean:+.4f} %" for mean in (night.q, night.u)),
-                self._reason(night),
-            )
-            for night in self.nights
-        )
+        rows = []
+        for night in self.nights:
+            evening = f"{night.night:.0f}" if np.isfinite(night.night) else ""
+            shifts = map(two_digits, (night.median, night.most, night.largest))
+            means = (f"{100 * mean:+.4f} %" for mean in (night.q, night.u))
+            rows.append((night.catalogue, evening, f"{night.stars}", *shifts, *means, self._reason(night)))
         head = ("catalogue", ">night", ">stars", ">median", ">95 %", ">largest", ">q", ">u", "")
         again = some(list(self.again), 10) if self.again else "nothing"
         facts = (("to be made again", again), ("limit", f"{self.limit:g} standard errors, 95 % of the stars"))
-        return Display("Shift of q, u by the new calibration, in standard errors", facts, head, rows)
+        return Display("Shift of q, u by the new calibration, in standard errors", facts, head, tuple(rows))
 
 
 def affected(

@@ -34,12 +34,17 @@ from walop_jax.science.star_residuals import StarResiduals
 from walop_jax.sky.moon import sky_to_instrument
 
 OfRows = Float[np.ndarray, "r k"]  # by row and camera
+Rows = Int[np.ndarray, " r"]
+Pairs = Float[np.ndarray, "s 2"]
+Covariances = Float[np.ndarray, "s 2 2"]
+Told = Callable[[int, int], None] | None
+Chosen = Bool[np.ndarray, " s"]
+OfStars = Int[np.ndarray, " s"]
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
 
-STAR_ROWS = 16384
-"""Rows of a star catalogue that are worked on together: their matrices take some MB."""
+STAR_ROWS = 16384  # rows of a star catalogue that are worked on together: their matrices take some MB
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
@@ -48,8 +53,7 @@ COOL, HOT = 3500.0, 10000.0
 _MOST_OF_TEFF = 0.5  # error of a TEFF, relative, that is propagated
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
 _STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
-IMPROBABLE = 1e-6
-"""Probability of a CHI2 as large below which FLAG 131072 is set, …"""
+IMPROBABLE = 1e-6  # probability of a CHI2 as large below which FLAG 131072 is set, …
 ROUGH = 0.005
 """… with so much of the light added to the errors: calibrations and flat fields are less perfect than bright stars."""
 
@@ -68,32 +72,28 @@ class Stars:
     over that they do not exclude (None: the level of the sky is not stated).
     """
 
-    qu: Float[np.ndarray, "s 2"]
-    photon: Float[np.ndarray, "s 2 2"]
-    calibration: Float[np.ndarray, "s 2 2"]
-    spectrum: Float[np.ndarray, "s 2 2"]
-    changed: Float[np.ndarray, "s 2 2"]
-    colour: Float[np.ndarray, "s 2"]
-    hidden: Float[np.ndarray, "s 2"]
+    qu: Pairs
+    photon: Covariances
+    calibration: Covariances
+    spectrum: Covariances
+    changed: Covariances
+    colour: Pairs
+    hidden: Pairs
     chi2: Float[np.ndarray, " s"]
-    dof: Int[np.ndarray, " s"]
-    rows: Int[np.ndarray, " s"]
-    flag: Int[np.ndarray, " s"]
+    dof: OfStars
+    rows: OfStars
+    flag: OfStars
     check: CatalogueCheck = NOTHING_TO_SPARE
     sky_bound: Float[np.ndarray, " s"] | None = None
 
     @property
-    def covariance(self) -> Float[np.ndarray, "s 2 2"]:
+    def covariance(self) -> Covariances:
         """Covariance of (q, u), all causes together."""
         return self.photon + self.calibration + self.spectrum + self.changed
 
 
 def apply(
-    calibration: Calibration,
-    catalogue: Catalogue,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    force: bool = False,
+    calibration: Calibration, catalogue: Catalogue, progress: Told = None, *, force: bool = False
 ) -> Stars:
     """Stokes parameters of all stars of a catalogue.
 
@@ -129,19 +129,17 @@ def residuals_of(
 ) -> list[StarResiduals]:
     """Residuals of stars, of about `rows` rows at most; none without a camera to spare. `DataError` as in `apply`."""
     work = _Application(vectors, catalogue, force=force)
-    chosen = work.sample(rows)
-    return [
-        residuals
-        for _, rows_there in work.blocks()
-        for residuals in work.residuals(work.block(rows_there), chosen)
-    ]
+    chosen, every = work.sample(rows), []
+    for _, rows_there in work.blocks():
+        every += work.residuals(work.block(rows_there), chosen)
+    return every
 
 
 class _Block(NamedTuple):
     """Rows of whole stars and all that was computed for them; `rows` are those of the catalogue."""
 
-    rows: Int[np.ndarray, " r"]
-    star: Int[np.ndarray, " r"]
+    rows: Rows
+    star: Rows
     stars: Stars
     found: Estimate
     vectors: Float[np.ndarray, "r k 3"]
@@ -166,12 +164,12 @@ class _Application:
         self.order = np.argsort(catalogue.star, kind="stable")
         self.on_sky = bool(np.isfinite(catalogue.rotator).any())
 
-    def blocks(self) -> Iterator[tuple[int, Int[np.ndarray, " r"]]]:
+    def blocks(self) -> Iterator[tuple[int, Rows]]:
         """Rows of whole stars, each with the number of rows done after it."""
         for done, rows in _slices_of_stars(self.catalogue.star[self.order]):
             yield done, self.order[rows]
 
-    def block(self, rows: Int[np.ndarray, " r"]) -> _Block:
+    def block(self, rows: Rows) -> _Block:
         """Stokes parameters of some stars."""
         catalogue, vectors, setting_of = self.catalogue, self.vectors, self.setting_of[rows]
         points, sigma, counts = catalogue.points, catalogue.sigma[rows], self.counts[rows]
@@ -222,7 +220,7 @@ class _Application:
         def change_of(weights: Float[np.ndarray, "r c"]) -> OfRows:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
 
-        def shift(change: OfRows) -> Float[np.ndarray, "s 2"]:
+        def shift(change: OfRows) -> Pairs:
             return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
 
         hidden = _hidden(vectors, derivative, {number: shift(change) for number, change in acting.items()})
@@ -260,16 +258,14 @@ class _Application:
         )
         return _Block(rows, star, stars, fitted, on_sky, sigma, plain, throughput, colour, derivative)
 
-    def outside(self, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
+    def outside(self, rows: Rows) -> Bool[np.ndarray, " r"]:
         """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
         points = self.catalogue.points
         return points.outside[rows] | (
             np.maximum(np.abs(points.x[rows]), np.abs(points.y[rows])) > self.vectors.half_width
         )
 
-    def flags(
-        self, rows: Int[np.ndarray, " r"], counts: OfRows, first: Int[np.ndarray, " s"], found: Estimate
-    ) -> Int[np.ndarray, " s"]:
+    def flags(self, rows: Rows, counts: OfRows, first: OfStars, found: Estimate) -> OfStars:
         """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
         points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
         settings, calibration = points.settings[rows], self.vectors.calibration
@@ -287,17 +283,19 @@ class _Application:
         # The largest signal-to-noise ratio of a camera.
         good = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
         bright = np.where(good, counts / np.where(good, sigma, 1.0), 0.0).max(axis=1)
-        flag[_disagree(found.chi2, found.dof, np.maximum.reduceat(bright, first))] |= Quality.DISAGREES
+        chi2 = found.chi2 / (1.0 + (ROUGH * np.maximum.reduceat(bright, first)) ** 2)
+        improbable = special.chdtri(np.arange(1, found.dof.max(initial=1) + 1), IMPROBABLE)
+        flag[chi2 > np.append(np.inf, improbable)[np.maximum(found.dof, 0)]] |= Quality.DISAGREES
         return flag
 
     # ------------------------------------------------------------------------------ the catalogue as a whole
 
-    def sample(self, most: int) -> Bool[np.ndarray, " s"]:
+    def sample(self, most: int) -> Chosen:
         """A sample of the stars, about `most` rows of them, spread by multiples of the golden section."""
         stars = np.arange(self.catalogue.star.max() + 1)
         return np.mod(stars * 0.6180339887498949, 1.0) < most / len(self.catalogue)
 
-    def residuals(self, block: _Block, chosen: Bool[np.ndarray, " s"]) -> list[StarResiduals]:
+    def residuals(self, block: _Block, chosen: Chosen) -> list[StarResiduals]:
         """Residuals of the chosen stars of a block: none, or one list of those that have a result within the field."""
         catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
         number = catalogue.star[block.rows]
@@ -337,7 +335,7 @@ class _Application:
         )
         return [residuals]
 
-    def checked(self, watched: list[StarResiduals], chosen: Bool[np.ndarray, " s"]) -> CatalogueCheck:
+    def checked(self, watched: list[StarResiduals], chosen: Chosen) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
 
         Errors of the calibration move the stars in proportion only while they are small beside the scale on which the
@@ -368,23 +366,16 @@ class _Application:
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
         """The stars with the errors, and a bit of FLAG, of the check of all of them."""
-        if check.holds:
-            return dataclasses.replace(stars, check=check)
         changed, flag = stars.changed, stars.flag
         if check.changes or check.places:
             of_blocks = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
             changed = np.concatenate([added for added, _ in of_blocks])
             flag = np.where(np.concatenate([near for _, near in of_blocks]), flag | Quality.PLACE, flag)
-        if check.holds_elsewhere:
-            return dataclasses.replace(stars, changed=changed, flag=flag, check=check)
-        factor = np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
-        flag |= Quality.CATALOGUE
-        photon = stars.photon * factor
+        flag = flag | (0 if check.holds_elsewhere else Quality.CATALOGUE)
+        photon = stars.photon * np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
         return dataclasses.replace(stars, photon=photon, changed=changed, flag=flag, check=check)
 
-    def _changed(
-        self, block: _Block, check: CatalogueCheck
-    ) -> tuple[Float[np.ndarray, "s 2 2"], Bool[np.ndarray, " s"]]:
+    def _changed(self, block: _Block, check: CatalogueCheck) -> tuple[Covariances, Chosen]:
         """Effect on stars of changes, of those alike the largest in q and in u; True for stars at a place."""
         points, fitted = self.catalogue.points, block.found
         cameras = self.vectors.instrument.cameras.names
@@ -393,7 +384,7 @@ class _Application:
         lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
 
-        def shift(entry: PossibleChange) -> Float[np.ndarray, "s 2"]:
+        def shift(entry: PossibleChange) -> Pairs:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
             grown, k = np.zeros_like(counts), cameras.index(entry.name)
@@ -423,7 +414,7 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
         start = end
 
 
-def _rows_by_setting(setting_of: Int[np.ndarray, " r"]) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
+def _rows_by_setting(setting_of: Rows) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
 
@@ -473,10 +464,8 @@ def check_validity(calibration: Calibration, settings: Settings) -> None:
         column, rows = "TEMP", beyond
         low, high = np.nanmin(calibration.exposures.temp), np.nanmax(calibration.exposures.temp)
         what = f"the calibration was made between {low:.1f} and {high:.1f} Celsius"
-    raise DataError(
-        f"{column}: {rows_text(np.flatnonzero(rows))}: {what}; apply a calibration that covers them, or --force "
-        "(force=True): FLAG 2048 marks these stars then"
-    )
+    advice = "apply a calibration that covers them, or --force (force=True): FLAG 2048 marks these stars then"
+    raise DataError(f"{column}: {rows_text(np.flatnonzero(rows))}: {what}; {advice}")
 
 
 def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Settings], Int[np.ndarray, " n"]]:
@@ -495,23 +484,12 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
     return [setting for setting, _ in layouts], of
 
 
-def _disagree(
-    chi2: Float[np.ndarray, " s"], dof: Int[np.ndarray, " s"], brightness: Float[np.ndarray, " s"]
-) -> Bool[np.ndarray, " s"]:
-    """Stars with significant residual χ² after adding `ROUGH` × flux to the errors."""
-    disagreeing = np.zeros(len(chi2), bool)
-    chi2 = chi2 / (1.0 + (ROUGH * brightness) ** 2)
-    for k in np.unique(dof[dof > 0]).tolist():
-        disagreeing |= (dof == k) & (chi2 > special.chdtri(k, IMPROBABLE))
-    return disagreeing
-
-
 # ---------------------------------------------------------------------------------- effects beyond the optics
 
 
 def _hidden(
     vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
-) -> Float[np.ndarray, "s 2"]:
+) -> Pairs:
     """Largest shift of q and u by one of the mistakes that would not have been found; NaN where not computed.
 
     `acting` are the shifts by those that act on starlight (`AnalysisVectors.acting`): parameters make up for a part.

@@ -5,23 +5,16 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data import user_tables
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
-from walop_jax.data.user_tables import (
-    OF_STARS,
-    InputTable,
-    column_of_stars,
-    numeric_column,
-    refuse_rounded,
-    sky_positions,
-    spellings,
-    vector_columns,
-)
+from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
@@ -29,6 +22,9 @@ from walop_jax.science.field_points import FieldPoints, doubt_radians, field_poi
 from walop_jax.sky.directions import same_stars
 
 Counts = Float[np.ndarray, "n k"]  # by row and camera
+OfRows = Float[np.ndarray, " n"]
+Numbers = Int[np.ndarray, " n"]
+Chosen = Bool[np.ndarray, " n"]
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 SAME_PLACE = 1.0  # arcsec
 ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
@@ -47,33 +43,29 @@ class Catalogue:
     """
 
     points: FieldPoints
-    teff_err: Float[np.ndarray, " n"]
+    teff_err: OfRows
     counts: Counts
     sigma: Counts
-    spoilt: Bool[np.ndarray, " n"]
-    copy: Bool[np.ndarray, " n"]
-    repeated: Bool[np.ndarray, " n"]
-    star: Int[np.ndarray, " n"]
-    rotator: Float[np.ndarray, " n"]
-    time: Float[np.ndarray, " n"]
+    spoilt: Chosen
+    copy: Chosen
+    repeated: Chosen
+    star: Numbers
+    rotator: OfRows
+    time: OfRows
     remarks: tuple[str, ...] = ()
     sky: Counts | None = None
 
     def __len__(self) -> int:
         return len(self.star)
 
-    def of_rows(self, keep: Bool[np.ndarray, " n"]) -> Catalogue:
+    def of_rows(self, keep: Chosen) -> Catalogue:
         """Some of the rows; stars are numbered anew."""
         if keep.all():
             return self
-        columns = {
-            f.name: getattr(self, f.name)
-            for f in dataclasses.fields(self)
-            if f.name not in ("points", "remarks") and getattr(self, f.name) is not None
-        }
+        columns: dict[str, Any] = {n: v[keep] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
         p = self.points
         points = FieldPoints(p.x[keep], p.y[keep], p.settings[np.flatnonzero(keep)], p.outside[keep])
-        subset = Catalogue(points=points, **{name: values[keep] for name, values in columns.items()})
+        subset = Catalogue(points=points, **columns)
         return dataclasses.replace(subset, star=np.unique(subset.star, return_inverse=True)[1].reshape(-1))
 
 
@@ -95,13 +87,13 @@ def read_catalogue(
     place = Place(source.path, "")
     points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
-    counts, sigma = vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
+    counts, sigma = user_tables.vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     points, teff_err = _with_colours(source, points, place)
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     flagged = _flagged(source, instrument.cameras.names, place)
     bad = flagged | (counts >= saturation) | (counts < -_NEGATIVE * sigma)
-    rotator, time = (numeric_column(source, name, EXPOSURES[name]) for name in ("ROTATOR", "MJD"))
+    rotator, time = (user_tables.numeric_column(source, name, EXPOSURES[name]) for name in ("ROTATOR", "MJD"))
     check({"ROTATOR": rotator, "MJD": time}, {name: EXPOSURES[name] for name in ("ROTATOR", "MJD")}, place)
     doubt_radians(source, "ROTATOR", rotator, place)
     star = _stars(source, points, place)
@@ -116,8 +108,10 @@ def read_catalogue(
         missing = rows_text(np.flatnonzero(~on_sky))
         source.remarks.append(f"ROTATOR is missing in {missing}: these are in the frame of the instrument")
     sky = None
-    if any({*form} & {*source.names} for form in spellings("SKY", cameras, instrument.cameras.names)):
-        (sky,) = vector_columns(source, ("SKY",), rule, instrument.cameras.names)
+    if any(
+        {*form} & {*source.names} for form in user_tables.spellings("SKY", cameras, instrument.cameras.names)
+    ):
+        (sky,) = user_tables.vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     stated = str(source.table.meta.get("INSTRUME", instrument.name))
     if stated.upper() != instrument.name.upper():
@@ -140,24 +134,21 @@ def read_catalogue(
     )
 
 
-CARRIED = ("RA", "DEC", *OF_STARS)
-"""Columns that are about the stars, and go through as they are."""
+CARRIED = ("RA", "DEC", *user_tables.OF_STARS)  # columns that are about the stars, and go through as they are
 
 
-def _with_colours(
-    source: InputTable, points: FieldPoints, place: Place
-) -> tuple[FieldPoints, Float[np.ndarray, " n"]]:
+def _with_colours(source: InputTable, points: FieldPoints, place: Place) -> tuple[FieldPoints, OfRows]:
     """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
     source.used.update(set(CARRIED) & set(source.names))
     source.lacking.update({"SOURCE_ID"} - set(source.names))
-    teff, error = points.settings.teff, np.nan_to_num(column_of_stars(source, "TEFF_ERR"))
+    teff, error = points.settings.teff, np.nan_to_num(user_tables.column_of_stars(source, "TEFF_ERR"))
     place.refuse(error < 0, "is below 0", "TEFF_ERR", "standard errors in K")
     error = np.where(np.isnan(teff), 0.0, error)
-    colour = np.where(np.isnan(teff), column_of_stars(source, "BP_RP"), np.nan)
+    colour = np.where(np.isnan(teff), user_tables.column_of_stars(source, "BP_RP"), np.nan)
     from_colour = np.isfinite(colour)
     if not from_colour.any():
         return points, error
-    temperature, off = temperature_of(colour, column_of_stars(source, "BP_RP_ERR"))
+    temperature, off = temperature_of(colour, user_tables.column_of_stars(source, "BP_RP_ERR"))
     within = np.isfinite(temperature)
     source.remarks.append(f"TEFF of {int(within.sum())} rows is made of BP_RP ({SOURCE})")
     if beyond := int(np.sum(from_colour & ~within)):
@@ -217,7 +208,7 @@ def _bit(text: str, name: str, place: Place) -> bool:
 _NO_ID = (*MISSING, "-1", "unknown")
 
 
-def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndarray, " n"]:
+def _stars(source: InputTable, points: FieldPoints, place: Place) -> Numbers:
     """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own."""
     rows = np.arange(source.rows)
     named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
@@ -231,7 +222,7 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
         raise place.fail(f"has shape {values.shape[1:]} in a row, one value is needed", "ID", "split it")
     if values.dtype.kind == "f":
         missing = missing | np.isnan(values)
-        refuse_rounded(values, missing, named, place)
+        user_tables.refuse_rounded(values, missing, named, place)
     if values.dtype.kind in "iuf":
         unknown = ~missing & ((values < 0) | (values == np.iinfo(np.uint64).max))
     else:
@@ -247,9 +238,7 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Int[np.ndar
     return _numbered(name, missing | unknown, points)
 
 
-def _numbered(
-    name: Int[np.ndarray, " n"], alone: Bool[np.ndarray, " n"], points: FieldPoints
-) -> Int[np.ndarray, " n"]:
+def _numbered(name: Numbers, alone: Chosen, points: FieldPoints) -> Numbers:
     """Numbers of stars by their name and filter; rows that are `alone` have each a number of their own."""
     band = np.unique(points.settings.filter, return_inverse=True)[1].reshape(-1)
     key = name * (band.max() + 1) + band
@@ -257,10 +246,10 @@ def _numbered(
     return np.unique(np.where(alone, single, key), return_inverse=True)[1].reshape(-1)
 
 
-def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n"]:
+def _by_position(source: InputTable, points: FieldPoints) -> Numbers:
     """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
-    ra, dec = sky_positions(source)
-    time = numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
+    ra, dec = user_tables.sky_positions(source)
+    time = user_tables.numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
     located = np.isfinite(ra) & np.isfinite(dec)
     name = np.zeros(len(ra), int)
     name[located] = same_stars(ra[located], dec[located], SAME_PLACE)
@@ -282,13 +271,8 @@ def _by_position(source: InputTable, points: FieldPoints) -> Int[np.ndarray, " n
 
 
 def _copies(
-    source: InputTable,
-    points: FieldPoints,
-    counts: Counts,
-    sigma: Counts,
-    rotator: Float[np.ndarray, " n"],
-    star: Int[np.ndarray, " n"],
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    source: InputTable, points: FieldPoints, counts: Counts, sigma: Counts, rotator: OfRows, star: Numbers
+) -> tuple[Chosen, Chosen]:
     """Rows that repeat one of their star, and rows with the position and counts of another star or setting.
 
     Noise does not repeat to the digits of a float32 in two cameras or more: such rows are one measurement, that with

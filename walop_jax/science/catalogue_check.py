@@ -17,6 +17,7 @@ describes the data as well (Δχ² < `RIVAL`) is reported together.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,38 +26,12 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    MOST_LIKELY,
-    RIVAL,
-    InstrumentChange,
-    PossibleChange,
-    chance_of,
-    profile,
-    threshold,
-)
+from walop_jax.science import instrument_changes as alarms
+from walop_jax.science import star_residuals as residuals
+from walop_jax.science.instrument_changes import InstrumentChange, PossibleChange, profile
 from walop_jax.science.left_over_sky import LeftOverSky
 from walop_jax.science.places import DisagreeingPlace, places_of
-from walop_jax.science.star_residuals import (
-    ABOUT_GAINS,
-    CROWDED,
-    FEW,
-    NO_NOISE,
-    SINGULAR,
-    Residuals,
-    Scale,
-    StarResiduals,
-    Weights,
-    beside_fitted,
-    chance_of_scale,
-    eliminated,
-    is_off,
-    noise_scale,
-    normal_matrix,
-    of_few,
-    own_variance,
-    shared_by_rows,
-)
+from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
 
 NOISE_MATTERS = 1.1
 """Factor on χ² below which, and above the inverse of which, errors are left as they are (5 % of N_ERR)."""
@@ -66,6 +41,7 @@ _SETTLED = 0.05  # standard errors
 _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
 _REFERENCE = 1e6  # electron
 
+Matrix = Float[np.ndarray, "c c"]
 Vector = Float[np.ndarray, " r"]  # a number for each row
 Sizes = Float[np.ndarray, " c"]  # of all columns
 CAMERA_KINDS = ("gain", "x", "y", "time", "flux", "light")
@@ -78,9 +54,7 @@ class Growth(NamedTuple):
     middle: float = 0.0
     half: float = 0.0
 
-    def electrons(
-        self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector
-    ) -> Float[np.ndarray, " r"]:
+    def electrons(self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector) -> Vector:
         """Electrons that a change of `CAMERA_KINDS`, or a spot, of unit size adds to `counts` of its camera."""
         if change.kind == "light":
             return np.ones_like(counts)
@@ -124,18 +98,18 @@ class CatalogueCheck:
     @property
     def alarm(self) -> float:
         """The chance below which a single answer counts."""
-        return ALARM / max(self.asked, 1)
+        return alarms.ALARM / max(self.asked, 1)
 
     @property
     def noise_is_off(self) -> bool:
         """True if the counts do not scatter by N_ERR."""
         off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
-        return self.noise > NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
+        return self.noise > residuals.NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
 
     @property
     def rows_agree(self) -> bool:
         """True if rows of a star have more in common than light."""
-        if self.rows is None or self.rows < NO_NOISE:
+        if self.rows is None or self.rows < residuals.NO_NOISE:
             return False
         return self.rows_p < self.alarm and self.rows > NOISE_MATTERS * self.noise
 
@@ -160,11 +134,9 @@ class CatalogueCheck:
         """A sentence for each thing that does not hold."""
         texts = [place.words() for place in self.places]
         if any(change.best.implausible for change in self.changes):
-            texts.insert(
-                0,
-                "the counts contradict the calibration by more than an instrument changes: are they of this "
-                "instrument, of all cameras in one unit and aperture, and in their order?",
-            )
+            what = "the counts contradict the calibration by more than an instrument changes"
+            question = "of this instrument, of all cameras in one unit and aperture, and in their order?"
+            texts.insert(0, f"{what}: are they {question}")
         else:
             texts = [*(change.words() for change in self.changes), *texts]
         if self.sky is not None and self.sky.found:
@@ -179,10 +151,8 @@ class CatalogueCheck:
         if self.noise_is_off:
             factor = np.sqrt(self.noise)
             word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
-            texts.append(
-                f"N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were multiplied by "
-                f"{factor:.3g}"
-            )
+            text = f"N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were"
+            texts.append(f"{text} multiplied by {factor:.3g}")
         return tuple(texts)
 
     def document(self) -> dict[str, Any]:
@@ -231,8 +201,8 @@ class CatalogueSearch:
         at: Float[np.ndarray, " n"] | None = None,
     ) -> None:
         self.stars = stars
-        self.variance = own_variance(stars)
-        self.crowded = bool(np.median(self.variance) > CROWDED)
+        self.variance = residuals.own_variance(stars)
+        self.crowded = bool(np.median(self.variance) > residuals.CROWDED)
         self.matters = np.abs(root).max(axis=0, initial=0.0) > 0
         self.root = root[:, self.matters]
         self.growth = Growth(max(float(np.abs(np.concatenate([stars.x, stars.y])).max()), 1e-9))
@@ -243,17 +213,15 @@ class CatalogueSearch:
         kinds = [kind for kind in CAMERA_KINDS if kind != "time" or self.growth.half > 0]
         units = {"flux": "per 1e6 electron", "light": "electron"}
         self.cameras = tuple(cameras)
-        self.of_cameras = [
-            PossibleChange(name, True, kind=kind, unit=units.get(kind, ""))
-            for kind in kinds
-            for name in cameras
-        ]
+        pairs = itertools.product(kinds, cameras)
+        self.of_cameras = [PossibleChange(n, True, kind=k, unit=units.get(k, "")) for k, n in pairs]
         plain = stars.plain.shape[-1]
         optics = (PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain])
         self.questions = [*self.of_cameras, *optics]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown, nuisances = len(self.of_cameras), len(root), self.root.shape[1]
         questions = self.asked = len(self.questions)
+        self._alarm = alarms.ALARM / (questions + 2)
         self.mixing = np.zeros((count + shown + 2, questions + nuisances + 2))
         self.mixing[:questions, :questions] = np.eye(questions)
         self.mixing[count : count + shown, questions : questions + nuisances] = self.root
@@ -264,7 +232,7 @@ class CatalogueSearch:
             self.start[questions : questions + nuisances] = at[self.matters]
         self.nearest = self.start
 
-    def _columns(self, part: StarResiduals) -> Float[np.ndarray, "r k c"]:
+    def _columns(self, part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
         cameras = part.model.shape[1]
         values = np.zeros((*part.model.shape, len(self.mixing)))
         place = (part.x, part.y, part.time)
@@ -282,31 +250,27 @@ class CatalogueSearch:
         if np.array_equal(sizes, self.start):
             return self.stars.residual
         amounts = self.mixing @ (sizes - self.start)
-        return self.stars.behind(self.stars.residual, lambda part, _: self._columns(part) @ amounts)
+        return self.stars.behind(self.stars.residual, lambda *part: self._columns(*part) @ amounts)
 
     def _looked(self, sizes: Sizes, *, stated: bool = False) -> _Look:
         """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
         def scale_of(residual: Residuals) -> Scale:
-            return noise_scale(stars.chi2(residual) / self.variance, dof)
+            return residuals.noise_scale(stars.chi2(residual) / self.variance, dof)
 
         residual = self._left(sizes)
-        noise, rows = scale_of(residual), shared_by_rows(stars, residual, self.variance)
+        noise, rows = scale_of(residual), residuals.shared_by_rows(stars, residual, self.variance)
 
         def look(scale: Scale, heavier: float = 1.0) -> _Look:
-            off = is_off(scale, self._alarm) and not self.crowded
+            off = residuals.is_off(scale, self._alarm) and not self.crowded
             single = heavier * (scale.value if scale.value > 1 or off else 1.0)
             several = single
             if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
             variances = self.variance * np.where(stars.rows > 1, several, single)
-            matrix, score = normal_matrix(
-                stars,
-                residual,
-                lambda part, _: self._columns(part),
-                Weights(scale.kept / variances, scale.share),
-            )
+            weights = Weights(scale.kept / variances, scale.share)
+            matrix, score = residuals.normal_matrix(stars, residual, self._columns, weights)
             matrix = self.mixing.T @ matrix @ self.mixing + np.diag(self.prior)
             return _Look(noise, rows, matrix, self.mixing.T @ score - self.prior * sizes)
 
@@ -314,13 +278,13 @@ class CatalogueSearch:
             return look(noise._replace(value=1.0))
         weighted = look(noise)
         # A common shift of all stars is no noise: weights come from the scatter about the gains that fit them best.
-        for _ in range(ABOUT_GAINS if is_off(noise, self._alarm) else 0):
+        for _ in range(residuals.ABOUT_GAINS if residuals.is_off(noise, self._alarm) else 0):
             gains, fitted = self._gains(weighted)
-            about = beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
-            if about.worth < FEW:
+            about = residuals.beside_fitted(scale_of(self._left(sizes + gains)), dof, fitted)
+            if about.worth < residuals.FEW:
                 break
-            off = is_off(about, self._alarm)
-            weighted = look(about, of_few(about, threshold(self._alarm)) if off else 1.0)
+            off = residuals.is_off(about, self._alarm)
+            weighted = look(about, residuals.of_few(about, alarms.threshold(self._alarm)) if off else 1.0)
         return weighted
 
     def _gains(self, look: _Look) -> tuple[Sizes, int]:
@@ -328,8 +292,8 @@ class CatalogueSearch:
         cameras = len(self.cameras)
         order = [*range(cameras), *range(self.asked, len(look.score))]
         gains = np.zeros_like(look.score)
-        matrix, score = eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
-        root = whitening(matrix, SINGULAR)
+        matrix, score = residuals.eliminated(look.matrix[np.ix_(order, order)], look.score[order], cameras)
+        root = whitening(matrix, residuals.SINGULAR)
         gains[:cameras] = root @ (root.T @ score)
         return gains, root.shape[1]
 
@@ -340,19 +304,24 @@ class CatalogueSearch:
         look = self._looked(sizes)
         tests = self._beside(look.matrix, look.score, chosen)
         if self._suspicious(look, tests):  # else one linear step is all there is to do
-            explained = self._explained()
-            by_errors = None if explained is None else self._looked(explained)
-            # Scatter that errors of the calibration can explain is not held against N_ERR.
-            if explained is not None and by_errors is not None and not is_off(by_errors.noise, self._alarm):
+            # Errors of the calibration that explain the stars best with N_ERR as stated.
+            _, explained = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
+            plausible = self._is_near(explained[self.asked : -2])
+            # Scatter that they can explain is not held against N_ERR.
+            if plausible and not residuals.is_off((by_errors := self._looked(explained)).noise, self._alarm):
                 look, sizes = by_errors, explained
             look, sizes = self._settled(look, sizes, chosen)
-            self.nearest = sizes if explained is None else explained
+            self.nearest = explained if plausible else sizes
             tests = self._beside(look.matrix, look.score, chosen)
-        smallest = self._smallest(tests)
+        # The gain change of one camera that raises the alarm in 99 % of cases.
+        least = min((t.error for t in tests if t.kind == "gain"), default=np.inf)
+        factor = alarms.threshold(self._alarm) + alarms.MOST_LIKELY
+        smallest = factor * least if np.isfinite(least) else np.nan
         answers = tests
         while len(chosen) < _MOST_CHANGES:
             strongest = max(range(self.asked), key=lambda n: abs(answers[n].sigma), default=-1)
-            if strongest < 0 or strongest in chosen or chance_of(answers[strongest].sigma) >= self._alarm:
+            new = strongest >= 0 and strongest not in chosen
+            if not new or alarms.chance_of(answers[strongest].sigma) >= self._alarm:
                 break
             chosen.append(strongest)
             look, sizes = self._settled(look, sizes, chosen)
@@ -365,7 +334,7 @@ class CatalogueSearch:
             rows_used=len(self.stars),
             asked=self.asked + 2,
             noise=noise.value,
-            noise_p=1.0 if self.crowded else chance_of_scale(noise),
+            noise_p=1.0 if self.crowded else residuals.chance_of_scale(noise),
             rows=None if rows is None else rows.value,
             rows_p=rows_p,
             tests=tuple(tests),
@@ -389,11 +358,9 @@ class CatalogueSearch:
                 break
         return places
 
-    def _explained(self) -> Sizes | None:
-        """Errors of the calibration that explain the stars best with N_ERR as stated; None if they cannot be."""
-        _, sizes = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
-        errors = sizes[self.asked : -2]
-        return sizes if errors @ errors <= _FARTHEST**2 * len(errors) else None
+    @staticmethod
+    def _is_near(errors: Float[np.ndarray, " n"]) -> bool:
+        return bool(errors @ errors <= _FARTHEST**2 * len(errors))
 
     def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
         """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
@@ -402,7 +369,7 @@ class CatalogueSearch:
         """
         errors = np.zeros(len(self.matters))
         errors[self.matters] = self.nearest[self.asked : -2]
-        return errors if errors @ errors <= _FARTHEST**2 * self.matters.sum() else None
+        return errors if self._is_near(errors[self.matters]) else None
 
     def bend(self, errors: Float[np.ndarray, " n"], residual: Residuals) -> float:
         """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
@@ -411,16 +378,12 @@ class CatalogueSearch:
         off = self.stars.chi2(residual - self._left(sizes)) / self.variance
         return float(np.median(off / np.maximum(self.stars.dof, 1)))
 
-    @property
-    def _alarm(self) -> float:
-        return ALARM / (self.asked + 2)
-
     def _suspicious(self, look: _Look, tests: list[PossibleChange]) -> bool:
         """True if anything comes near an alarm."""
-        near = 100.0 * self._alarm
         rows = 1.0 if look.rows is None else _chance_beside(look.rows, look.noise)
         strongest = max((abs(test.sigma) for test in tests), default=0.0)
-        return min(rows, chance_of_scale(look.noise), chance_of(strongest)) < near
+        chances = rows, residuals.chance_of_scale(look.noise), alarms.chance_of(strongest)
+        return min(chances) < 100.0 * self._alarm
 
     def _settled(
         self, look: _Look, sizes: Sizes, chosen: list[int], *, stated: bool = False
@@ -429,7 +392,7 @@ class CatalogueSearch:
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
             matrix = look.matrix[np.ix_(fitted, fitted)]
-            root = whitening(matrix, SINGULAR)
+            root = whitening(matrix, residuals.SINGULAR)
             step = root @ (root.T @ look.score[fitted])
             if step @ matrix @ step < _SETTLED**2:
                 break
@@ -438,13 +401,11 @@ class CatalogueSearch:
             look = self._looked(sizes, stated=stated)
         return look, sizes
 
-    def _beside(
-        self, matrix: Float[np.ndarray, "c c"], score: Sizes, chosen: list[int]
-    ) -> list[PossibleChange]:
+    def _beside(self, matrix: Matrix, score: Sizes, chosen: list[int]) -> list[PossibleChange]:
         """Every question, alone beside `chosen`, which have no answer here."""
         free = [n for n in range(self.asked) if n not in chosen]
         order = [*free, *chosen, *range(self.asked, len(score))]
-        remaining, along = eliminated(matrix[np.ix_(order, order)], score[order], len(free))
+        remaining, along = residuals.eliminated(matrix[np.ix_(order, order)], score[order], len(free))
         sizes = [*self.questions]
         for n, information, slope in zip(free, np.diag(remaining), along, strict=True):
             if information > 1e-9 * matrix[n, n]:
@@ -459,21 +420,16 @@ class CatalogueSearch:
         score = look.score + look.matrix @ away
         measured = self._beside(look.matrix, score, [k for k in chosen if k != asked])
         best = max(measured, key=lambda entry: entry.sigma**2)
-        alike = [entry for entry in measured if entry.sigma**2 > best.sigma**2 - RIVAL]
+        alike = alarms.rivals_of(best, measured)
         # A gain is the simplest of what describes the stars alike.
         ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
         return InstrumentChange(ranked[0], tuple(ranked))
-
-    def _smallest(self, tests: list[PossibleChange]) -> float:
-        """The gain change of one camera that raises the alarm in 99 % of cases."""
-        errors = [t.error for t in tests if t.kind == "gain" and np.isfinite(t.error)]
-        return (threshold(self._alarm) + MOST_LIKELY) * min(errors) if errors else np.nan
 
 
 class _Look(NamedTuple):
     noise: Scale
     rows: Scale | None
-    matrix: Float[np.ndarray, "c c"]
+    matrix: Matrix
     score: Sizes
 
 

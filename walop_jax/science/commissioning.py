@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,45 +23,19 @@ def requirements(
     The accuracy of a fit that is not trusted is not known: nothing is required of it.
     """
     blocking = [doubt.sentence for doubt in verdict.against if doubt.blocking and doubt.sentence]
+    judged = "trusted" if verdict.trusted else [*blocking, *verdict.warnings, "not trusted"][0]
+    minimum = "the fit has reached its minimum", verdict.converged, message or "converged"
+    explains = "the model explains the data", verdict.trusted, judged
     checks = [
-        Requirement(
-            "the fit has reached its minimum", verdict.converged, message or "converged",
-            "look at the data with walop-jax inspect",
-        ),
-        Requirement(
-            "the model explains the data", verdict.trusted,
-            "trusted" if verdict.trusted else [*blocking, *verdict.warnings, "not trusted"][0],
-            "walop-jax diagnose looks for missing effects",
-        ),
-    ]  # fmt: skip
+        Requirement(*minimum, "look at the data with walop-jax inspect"),
+        Requirement(*explains, "walop-jax diagnose looks for missing effects"),
+    ]
     if accuracy is not None and verdict.trusted:
         checks += [accuracy.middle, *accuracy.requirements]
     for finding in () if calset is None else inspect(calset).findings:
         fault = finding.severity == "fault"
         checks.append(Requirement("exposures and errors", False, finding.what, finding.advice, fault))
     return tuple(checks)
-
-
-def is_go(asked: Sequence[Requirement]) -> bool:
-    """True if everything that is needed is met."""
-    return all(need.met for need in asked if need.needed)
-
-
-def requirement_rows(asked: Sequence[Requirement]) -> tuple[tuple[str, str, str], ...]:
-    """A row for each requirement: ok, NO where it is needed, advice where it is not; the requirement, the result."""
-    return tuple(
-        ("ok" if need.met else "NO" if need.needed else "advice", need.what, need.found) for need in asked
-    )
-
-
-def requirement_advice(asked: Sequence[Requirement]) -> tuple[str, ...]:
-    """Advice on requirements that are not met, the needed ones first."""
-    ordered = sorted(asked, key=lambda need: not need.needed)
-    return tuple(
-        need.found if need.advice in need.found else f"{need.found}: {need.advice}"
-        for need in ordered
-        if not need.met
-    )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -72,9 +45,9 @@ class Certificate(Displayed):
     path: Path
     checks: tuple[Check, ...]
     requirements: tuple[Requirement, ...]
-    validity: Validity
-    content: str
-    parents: tuple[str, ...]
+    validity: Validity | None = None
+    content: str = ""
+    parents: tuple[str, ...] = ()
 
     @property
     def failed(self) -> tuple[Check, ...]:
@@ -84,12 +57,13 @@ class Certificate(Displayed):
     @property
     def go(self) -> bool:
         """True if the product is valid and everything that is needed is met."""
-        return not self.failed and is_go(self.requirements)
+        return not self.failed and all(need.met for need in self.requirements if need.needed)
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Advice on requirements that are not met, the needed ones first."""
-        return requirement_advice(self.requirements)
+        missing = sorted((n for n in self.requirements if not n.met), key=lambda need: not need.needed)
+        return tuple(n.found if n.advice in n.found else f"{n.found}: {n.advice}" for n in missing)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -101,13 +75,14 @@ class Certificate(Displayed):
             "schema": PRODVERS,
             "content": self.content,
             "parents": list(self.parents),
-            "validity": self.validity._asdict(),
+            "validity": self.validity and self.validity._asdict(),
             "checks": [check._asdict() for check in self.checks],
         }
 
     def display(self) -> Display:
-        """Go or no-go, a line for each check and requirement, and advice on those that are not met."""
+        """Go or no-go, a line for each check and requirement (NO: it is needed), and advice on those not met."""
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
-        rows += requirement_rows(self.requirements)
+        for need in self.requirements:
+            rows.append(("ok" if need.met else "NO" if need.needed else "advice", need.what, need.found))
         title = f"{self.path}: {'go' if self.go else 'NO GO'}"
         return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)

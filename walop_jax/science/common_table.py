@@ -30,6 +30,10 @@ from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
 from walop_jax.sky.moon import sky_to_instrument
 
+Vector = Float[np.ndarray, " n"]
+Pairs = Float[np.ndarray, "n 2"]
+Covariances = Float[np.ndarray, "n 2 2"]
+
 REFERENCE = "Panopoulou et al. 2025, ApJS 276, 15"
 MJD_ZERO = 2400000.5
 _SAME = 1e-6  # of fractions that are computed in two ways
@@ -57,9 +61,7 @@ def columns() -> Mapping[str, CommonColumn]:
 _WHOLE = ("dof", "Nobs", "Flag")
 
 
-def to_galactic(
-    qu: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "n 2 2"], north: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+def to_galactic(qu: Pairs, covariance: Covariances, north: Vector) -> tuple[Pairs, Covariances]:
     """(q, u) and covariance from Galactic north, which has the position angle `north` (deg) at each star."""
     turn = np.stack(sky_to_instrument(np.array([1.0, 0.0]), np.array([0.0, 1.0]), north[:, None]), axis=1)
     return np.einsum("nij,nj->ni", turn, qu), turn @ covariance @ turn.swapaxes(1, 2)
@@ -82,10 +84,8 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     def number(name: str) -> np.ndarray:
         return numeric_column(source, name, Column("float", units.get(name, ""), missing=np.nan))
 
-    values = {
-        name: number(name)
-        for name in ("Q", "U", "Q_ERR", "U_ERR", "QU_COV", "Q_PHOTON", "U_PHOTON", "QU_PHOTON")
-    }
+    names = ("Q", "U", "Q_ERR", "U_ERR", "QU_COV", "Q_PHOTON", "U_PHOTON", "QU_PHOTON")
+    values = {name: number(name) for name in names}
     rotator = number("ROTATOR")
     every_ra, every_dec = sky_positions(source)
     good = np.isfinite(values["Q"]) & np.isfinite(values["U"])
@@ -144,24 +144,18 @@ def common_table(source: InputTable) -> tuple[Any, tuple[str, ...]]:
     return table, tuple(remarks)
 
 
-def _covariance(
-    q: Float[np.ndarray, " n"], u: Float[np.ndarray, " n"], both: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 2 2"]:
+def _covariance(q: Vector, u: Vector, both: Vector) -> Covariances:
     return np.moveaxis(np.array([[q**2, both], [both, u**2]]), 2, 0)
 
 
-def _about_north(
-    ra: Float[np.ndarray, " n"], dec: Float[np.ndarray, " n"], rotator: Float[np.ndarray, " n"]
-) -> list[str]:
+def _about_north(ra: Vector, dec: Vector, rotator: Vector) -> list[str]:
     """A sentence where one ROTATOR for all stars leaves meridian convergence, RA times sin DEC, in their angles."""
     away = np.mod(ra - ra[0] + 180.0, 360.0) - 180.0
     off = float(np.ptp(away)) * float(np.abs(np.sin(np.deg2rad(dec))).max()) / 2.0
     if len(ra) < 2 or np.ptp(rotator) > 0.0 or off < 0.05:
         return []
-    return [
-        f"ROTATOR is the same for all stars: their angles refer to north at the field centre, up to {off:.2g} deg from "
-        "their own; give that at each star (walop-jax gather does)"
-    ]
+    what = f"their angles refer to north at the field centre, up to {off:.2g} deg from their own"
+    return [f"ROTATOR is the same for all stars: {what}; give that at each star (walop-jax gather does)"]
 
 
 def check_common_table(table: Any) -> tuple[str, ...]:
@@ -176,11 +170,8 @@ def check_common_table(table: Any) -> tuple[str, ...]:
     """
     if isinstance(table, str | os.PathLike):
         table = read_input_table(table, ("Pol",)).table
-    faults = [
-        f"{name}: the column is missing"
-        for name, entry in columns().items()
-        if entry.needed and name not in table.colnames
-    ]
+    missing = (n for n, entry in columns().items() if entry.needed and n not in table.colnames)
+    faults = [f"{name}: the column is missing" for name in missing]
     for name in table.colnames:
         column, entry = table[name], columns().get(name)
         if not column.description:
@@ -198,12 +189,8 @@ def check_common_table(table: Any) -> tuple[str, ...]:
 
 def _wrong_numbers(table: Any) -> tuple[str, ...]:
     """Sentences on rows whose numbers contradict each other."""
-    texts = ("Name", "Filter", "Inst", "GaiaID")
-    c = {
-        name: np.ma.filled(np.ma.asarray(table[name], float), np.nan)
-        for name in columns()
-        if name in table.colnames and name not in texts
-    }
+    numbers = [n for n in columns() if n in table.colnames and n not in ("Name", "Filter", "Inst", "GaiaID")]
+    c = {name: np.ma.filled(np.ma.asarray(table[name], float), np.nan) for name in numbers}
     qu, p = np.stack([c["q"], c["u"]], axis=1), np.hypot(c["q"], c["u"])
     ra, dec = c["RAJ2000"], c["DEJ2000"]
     longitude, latitude, north = galactic(ra, np.clip(dec, -90.0, 90.0))
@@ -229,11 +216,8 @@ def _wrong_numbers(table: Any) -> tuple[str, ...]:
         + np.abs(c["GLAT"] - latitude)
         > _SAME_ANGLE,
     }
-    return tuple(
-        f"{what} ({int(rows.sum())} rows, the first {int(np.argmax(rows))}, counted from 0)"
-        for what, rows in wrong.items()
-        if rows.any()
-    )
+    there = ((what, int(rows.sum()), int(np.argmax(rows))) for what, rows in wrong.items() if rows.any())
+    return tuple(f"{what} ({count} rows, the first {first}, counted from 0)" for what, count, first in there)
 
 
 def _apart(one: np.ndarray, other: np.ndarray, turn: float = 180.0) -> np.ndarray:

@@ -21,8 +21,7 @@ SHOWN = 4  # numbers that one mistake explains
 ANGLES = ("EVPA", "EVPA_SKY")  # degrees, the same after half a turn
 PACK = files("walop_jax") / "science" / "conformance_pack"
 
-Key = tuple[str, str]
-"""A case and a quantity."""
+Key = tuple[str, str]  # a case and a quantity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,12 +86,8 @@ def judge(answers: dict[Key, float | None]) -> Conformance:
     for (case, quantity), right in expected.items():
         answer = answers.get((case, quantity))
         if not same(quantity, answer, right):
-            likely = (
-                row["MISTAKE"]
-                for row in mistakes
-                if (row["CASE"], row["QUANTITY"]) == (case, quantity)
-                and same(quantity, answer, float(row["VALUE"]))
-            )
+            asked = (row for row in mistakes if (row["CASE"], row["QUANTITY"]) == (case, quantity))
+            likely = (row["MISTAKE"] for row in asked if same(quantity, answer, float(row["VALUE"])))
             wrong.append(Deviation(case, quantity, answer, right, next(likely, "")))
     return Conformance(len(expected), tuple(wrong))
 

@@ -172,14 +172,9 @@ class Epoch(Displayed):
         }
         if self.added:
             facts = {"not in the old model": ", ".join(self.added)} | facts
-        remaining = len(self.moved) - _SHOWN
-        return Display(
-            title,
-            tuple(facts.items()),
-            head=("parameter", ">old", ">new", ">change / σ", "unit"),
-            rows=tuple(rows),
-            notes=(f"{remaining} more in to_table()",) if remaining > 0 else (),
-        )
+        head, remaining = ("parameter", ">old", ">new", ">change / σ", "unit"), len(self.moved) - _SHOWN
+        notes = (f"{remaining} more in to_table()",) if remaining > 0 else ()
+        return Display(title, tuple(facts.items()), head, tuple(rows), notes)
 
 
 def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
@@ -274,11 +269,8 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
     effects = set(new.effect_names) - set(old.effect_names)
     shapes = {kind.name: kind.shape for kind in new.catalogue}
     free = [new.parameters[i] for i in new.free]
-    return [
-        p.name
-        for p in free
-        if p.part in effects and p.name.removeprefix(f"{p.part}.").split(".")[0] not in shapes.get(p.part, ())
-    ]
+    leaf = {p.name: p.name.removeprefix(f"{p.part}.").split(".")[0] for p in free}
+    return [p.name for p in free if p.part in effects and leaf[p.name] not in shapes.get(p.part, ())]
 
 
 class MeasuredChange(NamedTuple):
@@ -334,16 +326,9 @@ class MeasuredChange(NamedTuple):
         p = float(special.chdtrc(1, z[way, i] ** 2))
         # Of one alone: a/√(V⁻¹)_ii, with the error 1/√(V⁻¹)_ii.
         error = self.sigma[i] * (width[0, i] if way == 0 else 1.0 / width[1, i])
-        return LargestChange(
-            self.names[int(i)],
-            float(z[way, i] * error),
-            float(error),
-            self.units[int(i)],
-            float(z[way, i]),
-            bool(way),
-            questions,
-            _of_several(p, questions),
-        )
+        name, unit, size = self.names[int(i)], self.units[int(i)], float(z[way, i] * error)
+        judged = float(z[way, i]), bool(way), questions, _of_several(p, questions)
+        return LargestChange(name, size, float(error), unit, *judged)
 
 
 def _visible(changed: Calibration) -> dict[str, float]:
@@ -357,9 +342,8 @@ def _visible(changed: Calibration) -> dict[str, float]:
 
 
 def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, float]]:
-    x, y = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 200))
-    low_x, high_x, low_y, high_y = new.field
-    x, y = 0.5 * ((low_x + high_x) + (high_x - low_x) * x), 0.5 * ((low_y + high_y) + (high_y - low_y) * y)
+    low, high = np.reshape(new.field, (2, 2)).T[..., None]
+    x, y = np.random.default_rng(0).uniform(low, high, (2, 200))
     settings, pairs = _seen_through(new), new.model.template.cameras.pairs
     vectors = []
     for calibration in (old, new):

@@ -101,16 +101,9 @@ def estimate(
     # F cancels between c = H Jᵀ w F with J = F tangent, so gain times δa·s is the shift of (q, u).
     gain = np.einsum("rij,jrk,rk->rik", photon[star], tangent, root * flux[:, None] ** 2, optimize=True)
     residual = np.einsum("rk,rk->r", weight, (data - flux[:, None] * model) ** 2)
-    rows_used = used.any(axis=1)
-    return Estimate(
-        qu=qu,
-        photon=photon,
-        condition=condition,
-        chi2=np.add.reduceat(residual, first),
-        dof=np.add.reduceat(used.sum(axis=1) - rows_used, first) - 2,
-        flux=flux,
-        gain=gain,
-    )
+    chi2 = np.add.reduceat(residual, first)
+    dof = np.add.reduceat(used.sum(axis=1) - used.any(axis=1), first) - 2
+    return Estimate(qu, photon, condition, chi2, dof, flux, gain)
 
 
 def calibration_shift(

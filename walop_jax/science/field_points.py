@@ -106,20 +106,12 @@ def field_points(
     limit = instrument.field_limit
     outside = np.maximum(np.abs(x), np.abs(y)) > limit
     if len(x) > _SINGLE and np.mean(outside) > 0.5:
-        raise place.fail(
-            f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}",
-            "X, Y",
-            "field coordinates are in degrees: are these arcmin or pixels?",
+        what = (
+            f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}"
         )
-    settings = Settings(
-        filter=columns["FILTER"],
-        teff=columns["TEFF"],
-        temperature=columns["TEMP"],
-        hour_angle=columns["HA"],
-        positions=positions,
-        turns=turns,
-    )
-    return FieldPoints(x=x, y=y, settings=settings, outside=outside)
+        raise place.fail(what, "X, Y", "field coordinates are in degrees: are these arcmin or pixels?")
+    stated = (columns[name] for name in ("FILTER", "TEFF", "TEMP", "HA"))
+    return FieldPoints(x, y, Settings(*stated, positions=positions, turns=turns), outside)
 
 
 def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:

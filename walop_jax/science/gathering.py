@@ -16,27 +16,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data import user_tables
 from walop_jax.data.camera_catalogues import CameraCatalogue
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import (
-    OF_STARS,
-    column_of_stars,
-    in_memory,
-    numeric_column,
-    read_input_table,
-    sky_positions,
-)
+from walop_jax.data.user_tables import OF_STARS
 from walop_jax.io.errors import fail
-from walop_jax.sky.directions import (
-    FEWEST_REGISTERED,
-    NOT_MOVED,
-    REACH,
-    Pointing,
-    Registration,
-    mutual,
-    registered,
-    separation,
-)
+from walop_jax.sky import directions
+from walop_jax.sky.directions import FEWEST_REGISTERED, Pointing, Registration
 
 BLEND = 8  # bit of N_FLAG
 FEWEST = 0.2  # of the stars of a camera must be those of the others
@@ -46,8 +32,12 @@ APART = {"MJD": 0.01, "TEMP": 0.5, "HA": 0.05}
 """Largest differences between catalogues of one exposure; other values are the same."""
 DIGITS = 1e-3  # to which cameras agree on a number of a star
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
-Columns = dict[str, tuple[np.ndarray, str, str]]
-"""Values, unit and description of columns by name."""
+Columns = dict[str, tuple[np.ndarray, str, str]]  # values, unit and description of columns by name
+Catalogues = Sequence[CameraCatalogue]
+Places = Sequence[Float[np.ndarray, "_ 2"]]
+Chosen = Bool[np.ndarray, "s k"]
+Found = Int[np.ndarray, "s k"]
+OnSky = Float[np.ndarray, "s 2"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +56,7 @@ class Gathered:
 
 
 def gather(
-    catalogues: Sequence[CameraCatalogue], names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
+    catalogues: Catalogues, names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
 ) -> Gathered:
     """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
 
@@ -74,10 +64,8 @@ def gather(
     """
     if len(fluxes := {camera.flux_name: camera for camera in catalogues}) > 1:
         what = " and ".join(f"{name} ({camera.path})" for name, camera in fluxes.items())
-        raise fail(
-            f"cameras have different fluxes: {what}",
-            advice="one kind of flux, in one aperture, is needed of all cameras: name it with --columns",
-        )
+        advice = "one kind of flux, in one aperture, is needed of all cameras: name it with --columns"
+        raise fail(f"cameras have different fluxes: {what}", advice=advice)
     places = [_place(camera, pointing) for camera in catalogues]
     moves = _registrations(catalogues, places, tolerance)
     texts = dict.fromkeys(text for camera in catalogues for text in camera.remarks)
@@ -114,26 +102,26 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
     `table` is a path, an astropy table, or columns by name. Positions are registered first, as between cameras.
     """
     read = isinstance(table, str | os.PathLike)
-    source = read_input_table(table, ("RA", "DEC")) if read else in_memory(table)
+    source = user_tables.read_input_table(table, ("RA", "DEC")) if read else user_tables.in_memory(table)
     if not set(OF_STARS) & set(source.names):
         raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
-    ra, dec = sky_positions(source)
-    near = separation(made.pointing.ra, made.pointing.dec, ra, dec) < FARTHEST
+    ra, dec = user_tables.sky_positions(source)
+    near = directions.separation(made.pointing.ra, made.pointing.dec, ra, dec) < FARTHEST
     reference = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
     place = np.stack([made.columns[name][0] for name in "XY"], axis=1)
     bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
-    magnitude = numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
-    move = registered(place, reference, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
+    magnitude = user_tables.numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
+    move = directions.registered(place, reference, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
     if not move.pairs and (not len(reference) or min(len(place), len(reference)) >= FEWEST_REGISTERED):
-        what = f"has no stars in common with the cameras within {REACH / 60.0:g} arcmin"
+        what = f"has no stars in common with the cameras within {directions.REACH / 60.0:g} arcmin"
         raise fail(what, file=source.path, advice="is it of this field? RA and DEC are in degrees")
-    _, stars, rows = mutual(move.apply(place), reference, tolerance)
+    _, stars, rows = directions.mutual(move.apply(place), reference, tolerance)
     columns = dict(made.columns)
     for name, (unit, about) in OF_STARS.items():
         if name in source.names:
             texts = name == "SOURCE_ID"
             values = np.full(len(place), "" if texts else np.nan, object if texts else float)
-            values[stars] = column_of_stars(source, name)[near][rows]
+            values[stars] = user_tables.column_of_stars(source, name)[near][rows]
             columns[name] = (_whole(values) if texts else values, unit, about)
     remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
     if replaced := [name for name in OF_STARS if name in source.names and name in made.columns]:
@@ -147,29 +135,26 @@ def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
 
 def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, "n 2"]:
     """Positions on the tangent plane (deg). Refuses a catalogue of another field."""
-    away = separation(pointing.ra, pointing.dec, catalogue.ra, catalogue.dec)
+    away = directions.separation(pointing.ra, pointing.dec, catalogue.ra, catalogue.dec)
     if (typical := float(np.median(away))) > FARTHEST:
-        raise fail(
-            f"its stars lie {typical:.3g} deg from the field centre RA {pointing.ra:.5g}, DEC {pointing.dec:.5g} deg",
-            file=catalogue.path,
-            advice="is it of another field? Is the centre in degrees (--ra, --dec)?",
-        )
+        centre = f"RA {pointing.ra:.5g}, DEC {pointing.dec:.5g} deg"
+        what = f"its stars lie {typical:.3g} deg from the field centre {centre}"
+        advice = "is it of another field? Is the centre in degrees (--ra, --dec)?"
+        raise fail(what, file=catalogue.path, advice=advice)
     near = away < 60.0
     place = np.full((len(catalogue), 2), np.inf)
     place[near] = np.stack(pointing.field_of(catalogue.ra[near], catalogue.dec[near]), axis=1)
     return place
 
 
-def _registrations(
-    catalogues: Sequence[CameraCatalogue], places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
-) -> tuple[Registration, ...]:
+def _registrations(catalogues: Catalogues, places: Places, tolerance: float) -> tuple[Registration, ...]:
     """Shift and rotation of each camera, against the median of all."""
-    first, moves = catalogues[0], [NOT_MOVED]
+    first, moves = catalogues[0], [directions.NOT_MOVED]
     for camera, place in zip(catalogues[1:], places[1:], strict=True):
-        move = registered(place, places[0], _brightness(camera), _brightness(first), tolerance)
+        move = directions.registered(place, places[0], _brightness(camera), _brightness(first), tolerance)
         if not move.pairs and min(len(place), len(places[0])) >= FEWEST_REGISTERED:
             apart = 60.0 * np.hypot(*(np.median(place, axis=0) - np.median(places[0], axis=0)))
-            what = f"has no stars in common with {first.path} within {REACH / 60.0:g} arcmin"
+            what = f"has no stars in common with {first.path} within {directions.REACH / 60.0:g} arcmin"
             where = f" (their centres are {apart:.2g} arcmin apart)" if apart > 1.0 else ""
             advice = "is it of the same field, and is its WCS right?"
             raise fail(what + where, file=camera.path, advice=advice)
@@ -194,9 +179,7 @@ def _about_moves(moves: Sequence[Registration], names: Sequence[str], tolerance:
     ]
 
 
-def _matched(
-    places: Sequence[Float[np.ndarray, "_ 2"]], tolerance: float
-) -> tuple[Int[np.ndarray, "s k"], Bool[np.ndarray, "s k"], Float[np.ndarray, "s 2"]]:
+def _matched(places: Places, tolerance: float) -> tuple[Found, Chosen, OnSky]:
     """The row of each star in every camera (-1: none), where that is ambiguous, and the mean position.
 
     The camera with the most stars begins; stars that only others see are added.
@@ -205,8 +188,9 @@ def _matched(
     index = np.full((0, cameras), -1)
     ambiguous, place = np.zeros((0, cameras), bool), np.zeros((0, 2))
     for k in sorted(range(cameras), key=lambda k: -len(places[k])):
-        doubtful, rows, stars = mutual(places[k], place, tolerance)
-        doubtful |= mutual(places[k], places[k], tolerance)[0]  # stars with another one of the same camera
+        doubtful, rows, stars = directions.mutual(places[k], place, tolerance)
+        # Stars with another one of the same camera.
+        doubtful |= directions.mutual(places[k], places[k], tolerance)[0]
         new = np.setdiff1d(np.arange(len(places[k])), rows)
         count = (index[stars] >= 0).sum(axis=1, keepdims=True)
         place[stars] = (count * place[stars] + places[k][rows]) / (count + 1)
@@ -219,40 +203,29 @@ def _matched(
     return index, ambiguous, place
 
 
-def _check_common(
-    catalogues: Sequence[CameraCatalogue], seen: Bool[np.ndarray, "s k"], tolerance: float
-) -> None:
+def _check_common(catalogues: Catalogues, seen: Chosen, tolerance: float) -> None:
     """Refuse a camera that hardly shares stars with the others."""
     shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
     for catalogue, count, common in zip(catalogues, seen.sum(axis=0), shared.sum(axis=0), strict=True):
         if common < FEWEST * count:
-            raise fail(
-                f"{common} of its {count} stars are matched with those of other cameras within {tolerance:g} arcsec",
-                file=catalogue.path,
-                advice="is it of the same field and WCS? --tolerance is in arcsec",
-            )
+            what = f"{common} of its {count} stars are matched with those of other cameras"
+            advice = "is it of the same field and WCS? --tolerance is in arcsec"
+            raise fail(f"{what} within {tolerance:g} arcsec", file=catalogue.path, advice=advice)
 
 
-def _check_distinct(catalogues: Sequence[CameraCatalogue], index: Int[np.ndarray, "s k"]) -> None:
+def _check_distinct(catalogues: Catalogues, index: Found) -> None:
     """Refuse a camera with the fluxes of another one: noise does not repeat."""
     for first, second in itertools.combinations(range(len(catalogues)), 2):
         both = index[(index[:, [first, second]] >= 0).all(axis=1)]
         one, other = (catalogues[k].flux[both[:, k]] for k in (first, second))
         measured = np.isfinite(one) & np.isfinite(other) & (one != 0)
         if np.sum(one[measured] == other[measured]) > max(SAME_FLUXES * measured.sum(), 1):
-            raise fail(
-                f"has the fluxes of {catalogues[first].path}: it is the same catalogue",
-                file=catalogues[second].path,
-                advice="give that of each camera once",
-            )
+            what = f"has the fluxes of {catalogues[first].path}: it is the same catalogue"
+            raise fail(what, file=catalogues[second].path, advice="give that of each camera once")
 
 
 def _columns(
-    catalogues: Sequence[CameraCatalogue],
-    pointing: Pointing,
-    index: Int[np.ndarray, "s k"],
-    ambiguous: Bool[np.ndarray, "s k"],
-    place: Float[np.ndarray, "s 2"],
+    catalogues: Catalogues, pointing: Pointing, index: Found, ambiguous: Chosen, place: OnSky
 ) -> tuple[Columns, list[str]]:
     def of_cameras(values: Sequence[np.ndarray], missing: Any) -> np.ndarray:
         of_each = zip(index.T, values, strict=True)

@@ -8,6 +8,7 @@ are given together.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,19 +17,13 @@ from scipy import special
 
 from walop_jax.io.text import some, with_error, with_minus_sign
 
-ALARM = 1e-4
-"""Probability that noise raises any alarm in a catalogue, or in all that are watched together."""
+ALARM = 1e-4  # probability that noise raises any alarm in a catalogue, or in all that are watched together
 RIVAL = 11.0
-LARGEST = 0.5
-"""Relative change of a camera beyond which the counts are not those of the instrument."""
-MOST_LIKELY = 2.33
-"""Standard deviations above the alarm from which 99 % are detected (one-sided)."""
-REACH = 3.0
-"""Sizes from the centre of a spot beyond which nothing is left of it."""
-Place = tuple[float, ...]
-"""Centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge."""
-UNNAMED = "unnamed"
-"""Kind and name of a change that nothing in its range describes."""
+LARGEST = 0.5  # relative change of a camera beyond which the counts are not those of the instrument
+MOST_LIKELY = 2.33  # standard deviations above the alarm from which 99 % are detected (one-sided)
+REACH = 3.0  # sizes from the centre of a spot beyond which nothing is left of it
+Place = tuple[float, ...]  # centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge
+UNNAMED = "unnamed"  # kind and name of a change that nothing in its range describes
 _UNEXPLAINED = "a change that no camera, arm or place of the field makes"
 _ONE_CATALOGUE = {
     "x": " at the edge of the field along +X",
@@ -132,6 +127,11 @@ class PossibleChange(NamedTuple):
             where = f" in a spot at X = {x}°, Y = {y}°, within {2 * self.place[2]:.2g}°"
         size = with_error(100 * abs(self.size), 100 * self.error)
         return f"{name} {('brighter', 'fainter')[lower]} by {size} %{where}"
+
+
+def rivals_of(best: PossibleChange, others: Iterable[PossibleChange]) -> list[PossibleChange]:
+    """Changes that describe the stars as well as the best, it included."""
+    return [entry for entry in others if entry.sigma**2 > best.sigma**2 - RIVAL]
 
 
 @dataclasses.dataclass(frozen=True)

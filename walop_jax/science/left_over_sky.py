@@ -27,8 +27,7 @@ from walop_jax.science.instrument_changes import MOST_LIKELY
 if TYPE_CHECKING:
     from walop_jax.science.apply import Stars
 
-CHANCE = 1e-5
-"""Probability that noise finds something in a sound catalogue."""
+CHANCE = 1e-5  # probability that noise finds something in a sound catalogue
 FEWEST = 50  # stars
 MOST = 20_000  # that are looked at
 FAR = 5.0  # standard deviations
@@ -77,15 +76,8 @@ class LeftOverSky:
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
-        return {
-            "q": float(self.share[0]),
-            "u": float(self.share[1]),
-            "errors": self.errors.tolist(),
-            "p_value": self.p_value,
-            "found": self.found,
-            "bound": self.bound,
-            "stars": self.stars,
-        }
+        document = {**dict(zip("qu", self.share.tolist(), strict=True)), "errors": self.errors.tolist()}
+        return document | {n: getattr(self, n) for n in ("p_value", "found", "bound", "stars")}
 
 
 def left_over_sky(

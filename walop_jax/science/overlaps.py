@@ -20,8 +20,7 @@ from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.instrument_changes import ALARM
 
 APART = 0.02  # deg: rows of a star that lie farther apart than that are at two places
-COMMON = float(special.chdtri(1, ALARM))
-"""Square of a normal deviate that is exceeded with that probability."""
+COMMON = float(special.chdtri(1, ALARM))  # square of a normal deviate that is exceeded with that probability
 _OUTLIER = 1e-6  # of a row: left out
 
 

@@ -27,15 +27,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize
 
 from walop_jax.io.text import some, with_error
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    REACH,
-    RIVAL,
-    Place,
-    PossibleChange,
-    chance_of,
-    profile,
-)
+from walop_jax.science import instrument_changes as alarms
+from walop_jax.science.instrument_changes import Place, PossibleChange, profile
 from walop_jax.science.star_residuals import Residuals, StarResiduals, own_variance
 
 CUT = 3.0
@@ -69,10 +62,9 @@ class DisagreeingPlace:
 
     def words(self) -> str:
         """The place in a sentence."""
-        details = [
-            f"{c.name} {('brighter', 'fainter')[c.size < 0]} by {with_error(100 * abs(c.size), 100 * c.error)} %"
-            for c in self.alike
-        ]
+        sizes = (with_error(100 * abs(c.size), 100 * c.error) for c in self.alike)
+        words = (f"{c.name} {('brighter', 'fainter')[c.size < 0]}" for c in self.alike)
+        details = [f"{word} by {size} %" for word, size in zip(words, sizes, strict=True)]
         return (
             f"{self.stars} stars near X {self.x:+.3f}°, Y {self.y:+.3f}° (within {2 * self.size:.2g}°) disagree with "
             f"the calibration together, {abs(self.sigma):.0f} σ: {some(details, 4, ' or ')} in the centre. Is there "
@@ -82,10 +74,8 @@ class DisagreeingPlace:
     def document(self) -> dict[str, Any]:
         """The place as plain data."""
         about = {name: getattr(self, name) for name in ("x", "y", "size", "sigma", "stars")}
-        alike = [
-            {"camera": k, "name": entry.name, "size": entry.size, "error": entry.error}
-            for k, entry in zip(self.cameras, self.alike, strict=True)
-        ]
+        pairs = zip(self.cameras, self.alike, strict=True)
+        alike = [{"camera": k, "name": c.name, "size": c.size, "error": c.error} for k, c in pairs]
         return about | {"alike": alike}
 
 
@@ -122,25 +112,22 @@ def places_of(
     cameras: Sequence[str],
     residual: Residuals | None = None,
     variance: OfStars | None = None,
-    alarm: float = ALARM,
+    alarm: float = alarms.ALARM,
 ) -> tuple[DisagreeingPlace, ...]:
     """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
 
     `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
     """
-    seen = _seen(
-        stars,
-        stars.residual if residual is None else residual,
-        own_variance(stars) if variance is None else variance,
-    )
+    residual = stars.residual if residual is None else residual
+    seen = _seen(stars, residual, own_variance(stars) if variance is None else variance)
     extent = max(float(np.abs([seen.x, seen.y]).max(initial=0.0)), 1e-9)
     places: list[DisagreeingPlace] = []
     remaining = np.ones(len(seen.x), bool)
     while len(places) < _MOST and remaining.sum() > 1:
         subset = seen.of(remaining)
         largest = strongest(subset, extent)
-        if largest.trials * chance_of(largest.sigma) >= alarm:
+        if largest.trials * alarms.chance_of(largest.sigma) >= alarm:
             break
         place = _described(subset, largest, cameras)
         places.append(place)
@@ -243,7 +230,7 @@ def _smoothed(
     index: Int[np.ndarray, " s"], values: OfStars, shape: tuple[int, ...], power: int
 ) -> Float[np.ndarray, " c"]:
     """Sums of values over cells with the weights g (`power` 1) or g² (2)."""
-    reach = _CELLS * int(REACH)
+    reach = _CELLS * int(alarms.REACH)
     kernel = np.exp(-0.5 * power * (np.arange(-reach, reach + 1) / _CELLS) ** 2)
     sums = np.bincount(index, values, minlength=int(np.prod(shape))).reshape(shape)
     for axis in (0, 1):
@@ -263,7 +250,7 @@ def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> Disagree
     scatter = (subset.chi2.sum() - best) / max(subset.dof.sum() - 4.0, 1.0)
     alike, numbers = [], []
     for (size, error, gain), _, k in fits:
-        if gain > best - RIVAL * max(1.0, scatter):
+        if gain > best - alarms.RIVAL * max(1.0, scatter):
             alike.append(PossibleChange(cameras[k], True, size=size, error=error, kind="spot", place=place))
             numbers.append(k)
     stars = int((profile(subset.x, subset.y, place) > np.exp(-2.0)).sum())

@@ -27,8 +27,7 @@ from scipy import special
 Vector = Float[np.ndarray, " s"]
 ESTIMATORS = ("MAS", "WK")
 _CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096  # σ_p from which C alone counts; angles, and stars at once
-NO_ANGLE = 180.0 / np.sqrt(12.0)
-"""Standard deviation (deg) of an angle of which nothing is known."""
+NO_ANGLE = 180.0 / np.sqrt(12.0)  # standard deviation (deg) of an angle of which nothing is known
 
 
 class Polarisation(NamedTuple):
@@ -65,13 +64,8 @@ def polarisation(
     weak = np.flatnonzero((p**2 < (1.0 - 1e-9) * _CERTAIN**2 * along) & (qq * uu > qu_**2))
     for chunk in np.array_split(weak, len(weak) // _TOGETHER + 1):
         error[chunk] = _spread_of_angles(qu[chunk], covariance[chunk])
-    return Polarisation(
-        degree=p,
-        debiased=debiased,
-        degree_error=np.sqrt(np.maximum(along, 0.0)),
-        angle=np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0),
-        angle_error=error,
-    )
+    angle = np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)
+    return Polarisation(p, debiased, np.sqrt(np.maximum(along, 0.0)), angle, error)
 
 
 def _spread_of_angles(qu: Float[np.ndarray, "s 2"], covariance: Float[np.ndarray, "s 2 2"]) -> Vector:

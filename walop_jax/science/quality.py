@@ -11,6 +11,9 @@ Limits      C = W (nothing but the catalogue is known of a star): M is infinite,
 
 from __future__ import annotations
 
+import csv
+import functools
+import io
 import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -32,33 +35,30 @@ from walop_jax.io.toml import Reader
 from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.sky.nights import night_of
 
-POLARISED = 0.005
-"""Catalogued p from which a standard shows angle and p, and below which it shows the zero."""
+POLARISED = 0.005  # catalogued p from which a standard shows angle and p, and below which it shows the zero
 HELD = 1e-3  # share of the information of the catalogue that the data must add to a star
 BEYOND = 2.0  # standard errors beyond a limit
 
-NUMBERS: Mapping[str, tuple[str, str]] = {
-    "CHI2DOF": ("", "chi2 per degree of freedom of the fit"),
-    "NSTD": ("", "polarised standards that the data measure"),
-    "ANGLE": ("deg", "angle of polarised standards, measured less catalogue"),
-    "ANGLE_ERR": ("deg", "standard error of ANGLE"),
-    "P_RATIO": ("", "p of polarised standards over the catalogue"),
-    "P_RATIO_ERR": ("", "standard error of P_RATIO"),
-    "NZERO": ("", "unpolarised standards that the data measure"),
-    "ZERO_Q": ("", "q of unpolarised standards, measured less catalogue"),
-    "ZERO_U": ("", "u of unpolarised standards, measured less catalogue"),
-    "ZERO_ERR": ("", "standard error of ZERO_Q and ZERO_U"),
-    "STDCHI2": ("", "chi2 of all standards against their catalogue, per number"),
-    "ACCURACY": ("", "error of p of a star from the calibration, median over the field"),
-    "HIDDEN": ("", "largest error of q or u that could hide, median over the field"),
-}
-"""Quality numbers that every night has, with unit and description; NaN where the run does not hold it."""
 ERRORS = {"ANGLE": "ANGLE_ERR", "P_RATIO": "P_RATIO_ERR", "ZERO_Q": "ZERO_ERR", "ZERO_U": "ZERO_ERR"}
 GAIN = "GAIN"
 OUTSIDE = "OUTSIDE"
 SAME = ("INSTRUME", "NIGHT", "FILTERS")
 """Columns that are alike in two rows of one night, of which the later one is kept."""
 Limits = Mapping[str, tuple[float, float]]
+
+
+@functools.cache
+def columns() -> Mapping[str, tuple[str, str]]:
+    """Unit and description of the columns of every table of nights (`quality_columns.csv`), in their order."""
+    text = (resources.files("walop_jax.science") / "quality_columns.csv").read_text("utf-8")
+    _, *rows = csv.reader(io.StringIO(text))
+    return {name: (unit, about) for name, unit, about in rows}
+
+
+def numbers() -> list[str]:
+    """The columns that are quality numbers, which follow the verdict; NaN where a run does not hold one."""
+    names = [*columns()]
+    return names[names.index("TRUSTED") + 1 :]
 
 
 class Standard(NamedTuple):
@@ -127,13 +127,10 @@ def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
     angles, ratios = _mean(angle), _mean(ratio)
     return {
         "NSTD": len(polarised),
-        "ANGLE": angles[0],
-        "ANGLE_ERR": angles[1],
-        "P_RATIO": ratios[0],
-        "P_RATIO_ERR": ratios[1],
+        **dict(zip(("ANGLE", "ANGLE_ERR"), angles, strict=True)),
+        **dict(zip(("P_RATIO", "P_RATIO_ERR"), ratios, strict=True)),
         "NZERO": len(zeros),
-        "ZERO_Q": zero[0][0],
-        "ZERO_U": zero[1][0],
+        **dict(zip(("ZERO_Q", "ZERO_U"), (mean for mean, _ in zero), strict=True)),
         "ZERO_ERR": float(np.hypot(zero[0][1], zero[1][1]) / np.sqrt(2.0)),
         "STDCHI2": float(np.sum(chi2)) / (2 * len(stars)) if stars else np.nan,
     }
@@ -184,25 +181,13 @@ def read_limits(path: str | os.PathLike[str] | None = None) -> Limits:
 
 def _limits(text: str) -> dict[str, tuple[float, float]]:
     read = Reader("")
-    content = read.values(dict.fromkeys((*NUMBERS, GAIN), tuple[float, float]), parse_toml(text), "")
+    content = read.values(dict.fromkeys((*numbers(), GAIN), tuple[float, float]), parse_toml(text), "")
     for name, (low, high) in content.items():
         if not low < high:
             raise read.fault("", f"{name} = [{low:g}, {high:g}]: the lowest value must be below the highest")
     return content
 
 
-COLUMNS: Mapping[str, tuple[str, str]] = {
-    "NIGHT": ("d", "MJD of the evening"),
-    "MJD_BEG": ("d", "first exposure"),
-    "MJD_END": ("d", "last exposure"),
-    "NIGHTS": ("", "nights in the run"),
-    "INSTRUME": ("", "instrument"),
-    "FILTERS": ("", "filters"),
-    "RUN": ("", "folder or file of the calibration"),
-    "CALHASH": ("", "content hash of the calibration"),
-    "TRUSTED": ("", "verdict on the fit"),
-    **NUMBERS,
-}
 OF_CAMERA = ("", "throughput of a camera over the mean of all")
 RULES = dict.fromkeys(("INSTRUME", "FILTERS", "RUN", "CALHASH"), Column("str", missing=""))
 RULES |= {"NIGHTS": Column("int", missing=0), "TRUSTED": Column("bool", missing=False)}
@@ -212,19 +197,19 @@ def table_of_nights(rows: Sequence[Mapping[str, Any]]) -> Any:
     """Rows as an astropy table with units and descriptions."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     values = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return astropy_table({name: (values[name], *COLUMNS.get(name, OF_CAMERA)) for name in names})
+    return astropy_table({name: (values[name], *columns().get(name, OF_CAMERA)) for name in names})
 
 
 def read_nights(path: Path) -> Any:
-    """The table of nights in a file, in the units of `COLUMNS`; `DataError` for one that is none."""
+    """The table of nights in a file, in the units of `columns`; `DataError` for one that is none."""
     source = read_input_table(path, (*SAME, "CALHASH"))
     table = source.table
     if lacking := [name for name in (*SAME, "CALHASH") if name not in table.colnames]:
         what = "the column is missing: this is no table of quality numbers"
         advice = "name the table that walop-jax quality has made, or a new one"
         raise fail(what, file=path, column=lacking[0], advice=advice)
-    stated = [name for name in table.colnames if name in COLUMNS or name.startswith(f"{GAIN}_")]
-    about = {name: COLUMNS.get(name, OF_CAMERA) for name in stated}
+    stated = [name for name in table.colnames if name in columns() or name.startswith(f"{GAIN}_")]
+    about = {name: columns().get(name, OF_CAMERA) for name in stated}
     rules = {name: RULES.get(name, Column("float", about[name][0], missing=np.nan)) for name in stated}
     nights = astropy_table({n: (numeric_column(source, n, rules[n]), *about[n]) for n in stated})
     for name in (other for other in table.colnames if other not in stated):
@@ -258,7 +243,7 @@ def judge(table: Any, limits: Limits) -> Any:
     for name in table.colnames:
         camera = name.startswith(f"{GAIN}_")
         low, high = limits.get(GAIN if camera else name, (-np.inf, np.inf))
-        if not (camera or name in NUMBERS):
+        if not (camera or name in numbers()):
             continue
         values, error = _plain(table[name]), _plain(table[ERRORS[name]]) if name in ERRORS else 0.0
         if camera:

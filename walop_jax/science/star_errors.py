@@ -116,17 +116,13 @@ def _two_by_two(vectors: Vectors) -> CameraPairs:
 
 def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
     """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
-    errors = errors if chosen is None else errors[chosen]
-    return {
-        name: {
-            "median": 100.0 * float(np.median(values)),
-            "rms": 100.0 * float(np.sqrt(np.mean(values**2))),
-            "p95": 100.0 * float(np.quantile(values, 0.95)),
-            "max": 100.0 * float(np.max(values)),
-            "share_below_goal": float(np.mean(values < GOAL)),
-        }
-        for name, values in zip(QUANTITIES, errors.T, strict=True)
-    }
+    numbers = {}
+    for name, values in zip(QUANTITIES, (errors if chosen is None else errors[chosen]).T, strict=True):
+        sizes = np.median(values), np.sqrt(np.mean(values**2)), np.quantile(values, 0.95), np.max(values)
+        percent = (100.0 * float(size) for size in sizes)
+        numbers[name] = dict(zip(("median", "rms", "p95", "max"), percent, strict=True))
+        numbers[name]["share_below_goal"] = float(np.mean(values < GOAL))
+    return numbers
 
 
 @dataclasses.dataclass(frozen=True)

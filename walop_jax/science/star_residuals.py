@@ -36,11 +36,9 @@ CHECKED_ROWS = 2048
 TRIMMED = 1e-3
 CROWDED = 1.5
 """Variance over that of the noise from which scatter says nothing of N_ERR: most of it is structure, or colours."""
-NO_NOISE = 1e-4
-"""χ² per degree of freedom below which counts hold no noise at all: they were computed, not measured."""
+NO_NOISE = 1e-4  # χ² per degree of freedom below which counts hold no noise: computed, not measured
 _ROUNDS = 50
-FEW = 4
-"""Stars, or degrees of freedom: of fewer a single star may be the scale."""
+FEW = 4  # stars, or degrees of freedom: of fewer a single star may be the scale
 ABOUT_GAINS = 2
 """Rounds in which the scale of stars is found about the gains that fit them best, and these with that scale."""
 SINGULAR = 1e-10
@@ -50,6 +48,9 @@ ROUNDING = 1e-12
 Residuals = Float[np.ndarray, "r k"]  # a number for each row and camera
 OfStars = Float[np.ndarray, " s"]  # one for each star
 Matrix = Float[np.ndarray, "c c"]
+
+
+_OF_ALL = ("together", "structure")  # fields that all stars have in common
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,11 +84,8 @@ class StarResiduals:
     @classmethod
     def joined(cls, parts: list[StarResiduals]) -> StarResiduals:
         """Several lists of stars as one."""
-        values = {
-            f.name: np.concatenate([getattr(p, f.name) for p in parts])
-            for f in dataclasses.fields(cls)
-            if f.name not in ("star", "together", "structure")
-        }
+        names = [f.name for f in dataclasses.fields(cls) if f.name not in ("star", *_OF_ALL)]
+        values = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         first = np.cumsum([0, *(len(p.photon) for p in parts[:-1])])
         star = np.concatenate([p.star + start for p, start in zip(parts, first, strict=True)])
         return cls(star=star, together=parts[0].together, structure=parts[0].structure, **values)
@@ -122,11 +120,7 @@ class StarResiduals:
         first = np.append(self.first, len(self))
         start, stop, _ = stars.indices(len(first) - 1)
         rows = slice(first[start], first[stop])
-        cut = {
-            f.name: getattr(self, f.name)[rows]
-            for f in dataclasses.fields(self)
-            if f.name not in ("star", "photon", "together", "structure")
-        }
+        cut = {name: values[rows] for name, values in vars(self).items() if name not in _OF_ALL}
         cut |= {"star": self.star[rows] - start, "photon": self.photon[stars]}
         return StarResiduals(together=self.together, **cut)
 
@@ -184,8 +178,7 @@ class Weights(NamedTuple):
     share: OfStars
 
 
-Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]
-"""Columns of some stars and their rows."""
+Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]  # columns of some stars and their rows
 
 
 def normal_matrix(

@@ -54,10 +54,8 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
         "FLAG": (stars.flag.astype(np.int32), "quality bits, 0 is good"),
     }
     if stars.sky_bound is not None:
-        columns["SKY_BOUND"] = (
-            stars.sky_bound,
-            "largest shift of Q, U by sky left over that is not excluded",
-        )
+        about = "largest shift of Q, U by sky left over that is not excluded"
+        columns["SKY_BOUND"] = (stars.sky_bound, about)
     units = {"EVPA": "deg", "EVPA_ERR": "deg"}
     return {name: (values[star], about, units.get(name, "")) for name, (values, about) in columns.items()}
 
@@ -103,10 +101,8 @@ def about_counts(
             yield f"{name} is used in {int(of_camera.sum())} of {len(counts)} rows: {what}"
     lit = used & (counts > 0)
     if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
-        yield (
-            f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons: is N in electrons? Magnitudes, rates "
-            "and means of exposures are not"
-        )
+        what = f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons"
+        yield f"{what}: is N in electrons? Magnitudes, rates and means of exposures are not"
     bright = counts > BRIGHT
     if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
         yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
@@ -137,7 +133,5 @@ def errors_in_words(columns: Mapping[str, tuple[Any, ...]]) -> str:
     if not measured.any():
         return ""
     share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
-    return (
-        f"; error of p {100 * float(np.median(error[measured])):.2g} % (median), photons make "
-        f"{100 * float(np.median(share)):.0f} % of its variance"
-    )
+    typical, part = (100 * float(np.median(values)) for values in (error[measured], share))
+    return f"; error of p {typical:.2g} % (median), photons make {part:.0f} % of its variance"

@@ -25,6 +25,7 @@ describes the stars, they have changed by something that has no name here.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,51 +39,25 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.science import instrument_changes as alarms
+from walop_jax.science import places
+from walop_jax.science import star_residuals as residuals
 from walop_jax.science.apply import residuals_of
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.instrument_changes import (
-    ALARM,
-    MOST_LIKELY,
-    RIVAL,
-    UNNAMED,
-    History,
-    PossibleChange,
-    profile,
-    threshold,
-)
-from walop_jax.science.places import Seen, Strongest, described, fitted, seen_from, share_of, strongest
-from walop_jax.science.star_residuals import (
-    ABOUT_GAINS,
-    CROWDED,
-    FEW,
-    ROUNDING,
-    SINGULAR,
-    TRIMMED,
-    Residuals,
-    Scale,
-    StarResiduals,
-    Weights,
-    beside_fitted,
-    eliminated,
-    is_off,
-    noise_scale,
-    normal_matrix,
-    of_few,
-    own_variance,
-)
+from walop_jax.science.instrument_changes import UNNAMED, History, PossibleChange, profile, threshold
+from walop_jax.science.places import Seen, Strongest, fitted
+from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
 from walop_jax.science.watch_found import Watch, WatchedChange
 from walop_jax.science.watch_readings import Answers, Readings
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
-MOST_GROUPS = 150
-"""Exposure groups that are separated; neighbours of more are joined."""
+MOST_GROUPS = 150  # exposure groups that are separated; neighbours of more are joined
 RIVALS = (
     "hwp1_axis", "hwp2_axis", "hwp1_crossing", "hwp2_crossing", "chwp_axis", "wollaston_axis", "upstream_retarder",
     "telescope_polarisation", "filter_shift",
 )  # fmt: skip
 """Effects of the optics that may have changed, beside the parameters of the model."""
-EDGES = (2.0, 8.0)
-"""Sharpness of spots: a blurred one and one with an edge."""
+EDGES = (2.0, 8.0)  # sharpness of spots: a blurred one and one with an edge
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
 _ROUNDS = 6
@@ -151,9 +126,7 @@ def with_rivals(calibration: Calibration) -> Calibration:
     return dataclasses.replace(calibration, model=model, values=values, covariance=covariance, hidden=None)
 
 
-def grouped(
-    time: Float[np.ndarray, " r"], most: int = MOST_GROUPS
-) -> tuple[Float[np.ndarray, " g"], Int[np.ndarray, " r"]]:
+def grouped(time: Float[np.ndarray, " r"], most: int = MOST_GROUPS) -> tuple[OfGroups, Int[np.ndarray, " r"]]:
     """Times of exposure groups and the group of every row; neighbours of more than `most` groups are joined."""
     times, group = np.unique(time, return_inverse=True)
     if len(times) > most:
@@ -163,10 +136,10 @@ def grouped(
     return times, group.reshape(-1)
 
 
+OfGroups = Float[np.ndarray, " g"]
 Matrix = Float[np.ndarray, "c c"]
 Score = Float[np.ndarray, " c"]
-Settled = tuple[WatchedChange, Residuals]
-"""A change, and the residuals behind it."""
+Settled = tuple[WatchedChange, Residuals]  # a change, and the residuals behind it
 
 
 class Watching:
@@ -180,7 +153,7 @@ class Watching:
         self.stars, self.cameras = stars, tuple(vectors.instrument.cameras.names)
         self.readings = Readings(stars, vectors)
         self.root = vectors.root[:, np.abs(vectors.root).max(axis=0, initial=0.0) > 0]
-        self.variance = own_variance(stars)
+        self.variance = residuals.own_variance(stars)
         self.time, self.group = grouped(stars.time)
         groups = len(self.time)
         self.histories = [History("step", g) for g in range(groups)]
@@ -190,7 +163,7 @@ class Watching:
         self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
         self.tests = len(self.histories) * self.readings.asked
         # Half of the false alarms are for spots: as many as there are would else take from all others.
-        self.alarm = threshold(0.5 * ALARM / self.tests)
+        self.alarm = threshold(0.5 * alarms.ALARM / self.tests)
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -206,46 +179,46 @@ class Watching:
         weights, scale, off = self._scaled(residual, np.zeros(len(self.time)))
         # The gains, then their gradients as well if the scatter about the gains is not that of noise.
         for kinds in (1, 3):
-            for _ in range(ABOUT_GAINS if off else 0):
+            for _ in range(residuals.ABOUT_GAINS if off else 0):
                 remaining, fitted = self._behind_gains(residual, weights, kinds * len(self.cameras))
                 rescaled = self._scaled(remaining, fitted)
-                if rescaled[1].worth < FEW:
+                if rescaled[1].worth < residuals.FEW:
                     return weights, scale
                 weights, _, off = rescaled
         return weights, scale
 
-    def _scaled(self, residual: Residuals, fitted: Float[np.ndarray, " g"]) -> tuple[Weights, Scale, bool]:
+    def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
-        dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
-        least = 1.0 if np.median(self.variance) > CROWDED else 0.0
-        overall = beside_fitted(noise_scale(chi2, dof), dof, float(fitted.sum()))
-        off = is_off(overall, alarm)
+        dof, alarm = self.stars.dof.astype(float), alarms.ALARM / (len(self.time) + 1)
+        least = 1.0 if np.median(self.variance) > residuals.CROWDED else 0.0
+        overall = residuals.beside_fitted(residuals.noise_scale(chi2, dof), dof, float(fitted.sum()))
+        off = residuals.is_off(overall, alarm)
         common = max(overall.value, least) if off else 1.0
         if fitted.any():  # N_ERR was in doubt ahead of the gains
-            common = max(overall.value, 1.0) * (of_few(overall, self.alarm) if off else 1.0)
+            common = max(overall.value, 1.0) * (residuals.of_few(overall, self.alarm) if off else 1.0)
         weight, share, several = np.where(overall.kept, 1.0 / common, 0.0), overall.share.copy(), off
         for pool in np.unique(self.pool):
             members = np.flatnonzero(self.pool == pool)
-            if len(members) < FEW:
+            if len(members) < residuals.FEW:
                 continue
             parameters = fitted[pool] if pool < len(fitted) else fitted.sum()
-            local = beside_fitted(noise_scale(chi2[members], dof[members]), dof[members], float(parameters))
-            mine, several = is_off(local, alarm), several or is_off(local, alarm)
-            larger = of_few(local, self.alarm) if fitted.any() else 1.0
+            local = residuals.beside_fitted(
+                residuals.noise_scale(chi2[members], dof[members]), dof[members], float(parameters)
+            )
+            mine, several = residuals.is_off(local, alarm), several or residuals.is_off(local, alarm)
+            larger = residuals.of_few(local, self.alarm) if fitted.any() else 1.0
             variance = max(local.value, least) * larger if mine else common
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
         return Weights(weight / self.variance, share), overall, several
 
-    def _behind_gains(
-        self, residual: Residuals, weights: Weights, count: int
-    ) -> tuple[Residuals, Float[np.ndarray, " g"]]:
+    def _behind_gains(self, residual: Residuals, weights: Weights, count: int) -> tuple[Residuals, OfGroups]:
         """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
         size, fitted = np.zeros((groups, count)), np.zeros(groups)
         for g in range(groups):
-            root = whitening(blocks[g, :count, g, :count], SINGULAR)
+            root = whitening(blocks[g, :count, g, :count], residuals.SINGULAR)
             size[g] = root @ (root.T @ slopes[g, :count])
             fitted[g] = root.shape[1]
 
@@ -295,10 +268,10 @@ class Watching:
             slopes = np.einsum("rkc,rk->rc", values, normal)
             np.add.at(score.reshape(groups, count), group, slopes[:, :count])
             pull += slopes[:, count:].sum(axis=0)
-        rounding = np.diag(gains) <= ROUNDING * diagonal.ravel()
+        rounding = np.diag(gains) <= residuals.ROUNDING * diagonal.ravel()
         gains[rounding], gains[:, rounding], cross[rounding], score[rounding] = 0.0, 0.0, 0.0, 0.0
         full = np.block([[gains, cross], [cross.T, nuisance]])
-        return eliminated(full, np.concatenate([score, pull]), groups * count)
+        return residuals.eliminated(full, np.concatenate([score, pull]), groups * count)
 
     @staticmethod
     def _subtract(
@@ -341,16 +314,13 @@ class Watching:
             if mine := [n for n, h in enumerate(self.histories) if h.kind == kind]:
                 top = max(mine, key=lambda n: strength[n])
                 compared += [n for n in (top - 1, top, top + 1) if n in mine]
-        listed = [
-            PossibleChange(
-                reading.name, reading.kind != "optics", self.histories[n], float(found.size[n, k]),
-                float(found.error[n, k]), reading.unit, reading.kind,
-                () if reading.across is None else (float(found.angle[n, k]),),
-            )
-            for n in compared
-            for k, reading in enumerate(self.readings.listed)
-            if np.isfinite(found.error[n, k])
-        ]  # fmt: skip
+        listed = []
+        for n, (k, reading) in itertools.product(compared, enumerate(self.readings.listed)):
+            size, error = float(found.size[n, k]), float(found.error[n, k])
+            place = () if reading.across is None else (float(found.angle[n, k]),)
+            since = reading.name, reading.kind != "optics", self.histories[n]
+            if np.isfinite(error):
+                listed.append(PossibleChange(*since, size, error, reading.unit, reading.kind, place))
         return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
 
     def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
@@ -385,7 +355,8 @@ class Watching:
         # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
-        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > special.chdtri(dof, ALARM / len(dof)))
+        largest = special.chdtri(dof, alarms.ALARM / len(dof))
+        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > largest)
         if not odd.any():
             return result
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
@@ -401,10 +372,10 @@ class Watching:
             return ways[0] if ways else None
         dof = self.stars.dof.astype(float)
         costs = [self.stars.chi2(remaining) / self.variance for _, remaining in ways]
-        scale = max(1.0, min(noise_scale(chi2, dof).value for chi2 in costs))
-        cut = special.chdtri(np.maximum(dof, 1e-12), TRIMMED)
+        scale = max(1.0, min(residuals.noise_scale(chi2, dof).value for chi2 in costs))
+        cut = special.chdtri(np.maximum(dof, 1e-12), residuals.TRIMMED)
         cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in costs]
-        near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
+        near = abs(cost[1] - cost[0]) < alarms.RIVAL and ways[1][0].best.kind != UNNAMED
         # The simpler one, if both are as good: spots are the first.
         (change, remaining), (alternative, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
         if near:
@@ -431,11 +402,8 @@ class Watching:
             if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
             before, best = best, ranked[0]
-            alike = [
-                entry
-                for entry in ranked
-                if entry.sigma**2 > best.sigma**2 - RIVAL and self.readings.possible(entry)
-            ]
+            alike = alarms.rivals_of(best, ranked)
+            alike = [entry for entry in alike if self.readings.possible(entry)]
             moved = abs(best.size - total) / best.error
             total = best.size
             remaining = self.without(residual, best, total)
@@ -460,31 +428,31 @@ class Watching:
         np.maximum.at(common, self.pool, weights.inverse * self.variance)
         inverse = common[self.pool] / self.variance
         usable = (inverse > 0) & ~self.spoilt
-        if usable.sum() < FEW:
+        if usable.sum() < residuals.FEW:
             return None
         variance = 1.0 / np.where(usable, inverse, 1.0)
         found: list[tuple[Strongest, int, Seen]] = []  # that of all rows, and the strongest
         trials = 0
-        later = seen_from(self.stars, self.group, self.readings.members, residual, variance)
+        later = places.seen_from(self.stars, self.group, self.readings.members, residual, variance)
         for start, seen in enumerate(every.of(usable) for every in later):
-            here = strongest(seen, self.readings.edge)
+            here = places.strongest(seen, self.readings.edge)
             trials += here.trials
             if start == 0 or abs(here.sigma) > abs(found[-1][0].sigma):
                 found = [*found[:1], (here, start, seen)]
-        (spot, start, seen), alarm = found[-1], threshold(0.5 * ALARM / max(trials, 1))
+        (spot, start, seen), alarm = found[-1], threshold(0.5 * alarms.ALARM / max(trials, 1))
         if abs(spot.sigma) < alarm:
             return None
         near = seen.near(spot.place)
         x, y, size = spot.place
         starts = [(x, y, share * size, edge) for share in (1.0, 2.0) for edge in EDGES]
         ways = [fitted(near, spot.camera, start) for start in starts]
-        gains = [share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
+        gains = [places.share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
         (size, *_), place = max(zip(gains, ways, strict=True), key=lambda way: way[0][2])
         name, since = self.readings.of_cameras[spot.camera].name, History("step", start)
         ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
         of_spot = np.zeros(len(usable), bool)
         for _, _, seen in found:
-            of_spot[usable] |= described(seen, spot.camera, place, size)
+            of_spot[usable] |= places.described(seen, spot.camera, place, size)
         weights = weights._replace(inverse=np.where(of_spot, inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
@@ -495,7 +463,7 @@ class Watching:
         best = ranked[0]
         if abs(best.sigma) < alarm or not self.readings.possible(best):
             return None
-        alike = [entry for entry in ranked if entry.sigma**2 > best.sigma**2 - RIVAL]
+        alike = alarms.rivals_of(best, ranked)
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
@@ -504,22 +472,18 @@ class Watching:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
-            steps = [
-                e.history.over(self.time)[self.group[rows], None] * self.readings.signature(part, e)
-                for e in asked
-            ]
+            grown = (e.history.over(self.time)[self.group[rows], None] for e in asked)
+            steps = [g * self.readings.signature(part, e) for g, e in zip(grown, asked, strict=True)]
             return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
 
-        matrix, score = normal_matrix(self.stars, residual, columns, weights)
+        matrix, score = residuals.normal_matrix(self.stars, residual, columns, weights)
         count, diagonal = len(asked), np.diag(matrix)
         matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
-        remaining, pull = eliminated(matrix, score, count)
-        information = np.diag(remaining)
-        sizes = [
-            entry._replace(size=float(s / i), error=float(i**-0.5))
-            for entry, s, i, full in zip(asked, pull, information, diagonal, strict=False)
-            if i > ROUNDING * full > 0
-        ]
+        remaining, pull = residuals.eliminated(matrix, score, count)
+        information, sizes = np.diag(remaining), []
+        for entry, s, i, full in zip(asked, pull, information, diagonal, strict=False):
+            if i > residuals.ROUNDING * full > 0:
+                sizes.append(entry._replace(size=float(s / i), error=float(i**-0.5)))
         return sorted(sizes, key=lambda entry: -abs(entry.sigma))
 
     def told(self, changes: list[WatchedChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
@@ -539,11 +503,11 @@ class Watching:
             error[:, k] = np.where(variances > 0, variances, np.nan) ** -0.5
             information = np.einsum("gh,gf,fh->h", steps, blocks[:, k, :, k], steps, optimize=True)
             measured = np.where(information > 0, information, np.nan)
-            smallest[:, k] = (self.alarm + MOST_LIKELY) * measured**-0.5
+            smallest[:, k] = (self.alarm + alarms.MOST_LIKELY) * measured**-0.5
         chi2, dof = self.stars.chi2(self.stars.residual), self.stars.dof.astype(float)
         pairs, ratio = np.unique(self.stars.star * groups + self.group), np.full(groups, np.nan)
         for g in np.unique(self.pool[self.pool < groups]):
-            ratio[g] = noise_scale(chi2[self.pool == g], dof[self.pool == g]).value
+            ratio[g] = residuals.noise_scale(chi2[self.pool == g], dof[self.pool == g]).value
         return Watch(
             cameras=self.cameras,
             time=self.time,
@@ -553,7 +517,7 @@ class Watching:
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=whole.value if is_off(whole, ALARM) else 1.0,
+            noise=whole.value if residuals.is_off(whole, alarms.ALARM) else 1.0,
             tests=self.tests,
             alarm=self.alarm,
         )

@@ -43,10 +43,8 @@ class WatchedChange(InstrumentChange):
 
     def words(self) -> str:
         """The change in a sentence."""
-        date, *ends = (
-            f"MJD {time:.4f}" if time > FIRST_DATE else f"group {time:g}"
-            for time in (self.time, *self.between)
-        )
+        times = (self.time, *self.between)
+        date, *ends = (f"MJD {t:.4f}" if t > FIRST_DATE else f"group {t:g}" for t in times)
         when = _COURSES[self.best.history.kind].format(date)
         spread = f"; it began between {ends[0]} and {ends[1]}" if ends[0] != ends[1] else ""
         significance = f"({abs(self.best.sigma):.0f} σ{spread})"
@@ -90,10 +88,8 @@ class Watch(Displayed):
         texts = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return texts
-        return (
-            *texts,
-            f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {np.sqrt(self.noise):.3g}",
-        )
+        factor = np.sqrt(self.noise)
+        return (*texts, f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {factor:.3g}")
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -102,11 +98,10 @@ class Watch(Displayed):
             start = float(self.time[entry.history.start])
             return entry._asdict() | {"history": entry.history.kind, "start": start, "sigma": entry.sigma}
 
-        entries = [
-            {"camera": c.camera, "time": c.time, "between": list(c.between)}
-            | {"best": plain(c.best), "alike": [plain(e) for e in c.alike]}
-            for c in self.changes
-        ]
+        entries = []
+        for c in self.changes:
+            entries.append({"camera": c.camera, "time": c.time, "between": list(c.between)})
+            entries[-1] |= {"best": plain(c.best), "alike": [plain(e) for e in c.alike]}
         of_cameras = {"gain": self.gain, "error": self.error, "smallest_step_seen": self.smallest}
         groups = [
             {"time": float(self.time[g]), "stars": int(self.stars[g]), "chi2_per_dof": float(self.chi2[g])}

@@ -60,19 +60,13 @@ class Readings:
         # The last arm is no other than all before it: the sum of all is flux.
         arms = [tuple(arm) for arm in cameras.arms if len(arm) > 1][: len(cameras.arms) - 1]
         units = [("gain", (k,)) for k in range(count)] + [("arm", arm) for arm in arms]
-        self.of_cameras = [
-            Reading(kind, "+".join(self.cameras[k] for k in unit), "", dict.fromkeys(unit, 1.0))
-            for kind, unit in units
-        ]
+        named = [(kind, "+".join(self.cameras[k] for k in unit), unit) for kind, unit in units]
+        self.of_cameras = [Reading(kind, name, "", dict.fromkeys(u, 1.0)) for kind, name, u in named]
         self.members = np.array([[r.along.get(k, 0.0) for r in self.of_cameras] for k in range(count)])
-        gradients = [
-            reading._replace(
-                kind="gradient",
-                along={count + k: 1.0 for k in reading.along},
-                across={2 * count + k: 1.0 for k in reading.along},
-            )
-            for reading in self.of_cameras
-        ]
+        gradients = []
+        for reading in self.of_cameras:
+            along, across = ({n * count + k: 1.0 for k in reading.along} for n in (1, 2))
+            gradients.append(reading._replace(kind="gradient", along=along, across=across))
         optics = []
         for column, p in enumerate(self.seen.tolist(), start=3 * count):
             name, unit = vectors.named[p]
