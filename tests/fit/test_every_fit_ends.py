@@ -80,7 +80,7 @@ def test_bad_data_cost_no_more_passes_than_they_are_worth(mistake, passes):
     assert result.converged or "walop-jax diagnose" in result.minimum.message
     steps = [line for line in told if "step" in line]
     assert all(" of at most " in line and "χ²/dof" in line for line in steps)
-    assert any(f"start {result.starts} of 13" in line for line in steps)
+    assert any(f"start {result.minimum.starts} of 13" in line for line in steps)
     # The best of all places looked at is what comes back.
     scaled = result.expansion.noise_scale
     at_start = Likelihood.of(calset, model).expand(model.start, scaled)

@@ -152,7 +152,7 @@ def test_a_search_ends_with_equal_plates_wherever_it_began(north):
     first = model.start.copy()
     for i, _ in ties(model):
         first[i] += 0.5
-    end = _search(north, "", first, 1.0, expand=expand).values
+    end = _search(north, "", first, 1.0, expand=expand).x
     np.testing.assert_allclose(end[model.free], goal, rtol=0, atol=TOLERANCE)  # errors are 1
     for values in (*seen, end):
         assert all(values[i] == values[master] for i, master in ties(model))
@@ -202,5 +202,5 @@ def test_fringes_of_another_order_are_no_end(start, monkeypatch):
     assert model.gaps() == (model.index("etalon.gap"),)
     assert bare.gaps() == ()
     found = find_minimum(likelihood, model.start, None, None)
-    assert found.values[model.index("etalon.gap")] == pytest.approx(GAP, abs=2e-3)
-    assert found.values[model.index("etalon.contrast")] == pytest.approx(CONTRAST, abs=1e-4)
+    assert found.x[model.index("etalon.gap")] == pytest.approx(GAP, abs=2e-3)
+    assert found.x[model.index("etalon.contrast")] == pytest.approx(CONTRAST, abs=1e-4)

@@ -159,7 +159,7 @@ def test_a_fit_says_so_and_is_not_forbidden():
     minimum = minimise(lambda x: expansion, np.zeros(n), np.ones(n))
     size = len(likelihood.model.names)
     result = FitResult(
-        likelihood, likelihood.model.start, np.zeros((size, size)), expansion, minimum, starts=1, seconds=0.0
+        likelihood, likelihood.model.start, np.zeros((size, size)), expansion, minimum, seconds=0.0
     ).judged()
     assert any("quartz was measured at 0.198 to 2.05 µm" in text for text in result.warnings)
     assert result.trusted

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+Matrices = Float[np.ndarray, "p a 3"]  # point, arm, element
+
 STARS, LARGEST_P = 100, 0.05
 GOAL = 0.001
 """Error of p that instruments are built for."""
@@ -54,9 +56,7 @@ def measures_u(matrix: Float[np.ndarray, "p 2 3"]) -> Bool[np.ndarray, " p"]:
     return np.abs(np.linalg.det(matrix[:, :, 1:])) >= SMALLEST_DETERMINANT
 
 
-def change_of_qu(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> Float[np.ndarray, " p"]:
+def change_of_qu(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> Float[np.ndarray, " p"]:
     """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
     errors = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
@@ -69,9 +69,7 @@ def change_of_qu(
     return errors
 
 
-def largest_change(
-    assumed: Float[np.ndarray, "p a 3"], true: Float[np.ndarray, "p a 3"], p: float = LARGEST_P
-) -> float:
+def largest_change(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> float:
     """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
     errors = change_of_qu(assumed, true, p)
     return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")

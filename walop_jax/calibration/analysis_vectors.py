@@ -35,6 +35,9 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import series_indices
 
+Vectors = Float[np.ndarray, "p k 3"]  # point, camera, Stokes
+Values = Float[np.ndarray, "p f"]  # of a table
+
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
 NODES = (20, 28, 40, 56, 80)  # per side, tried in turn
@@ -118,9 +121,7 @@ class AnalysisVectors:
         """Vectors (point, colour, camera, Stokes) in one setting, for the spectra that `colour_weights` mixes."""
         return self._kept(self._vector_table, setting)(x, y).reshape(len(x), COLOURS + 1, self.cameras, 3)
 
-    def coloured(
-        self, setting: Settings, x: Vector, y: Vector, teff: Vector | None = None
-    ) -> Float[np.ndarray, "p k 3"]:
+    def coloured(self, setting: Settings, x: Vector, y: Vector, teff: Vector | None = None) -> Vectors:
         """Vectors (point, camera, Stokes) for sources of colour temperature `teff` (K; NaN, None: flat)."""
         teff = np.full(len(x), np.nan) if teff is None else teff
         return np.einsum("pc,pcks->pks", colour_weights(teff, COLOURS), self.at(setting, x, y))
@@ -146,7 +147,7 @@ class AnalysisVectors:
         angles = {number: turn_of(self.instrument, effect) for number, effect in self.acting.items()}
         return {number: turn for number, turn in angles.items() if turn}
 
-    def added(self, setting: Settings, x: Vector, y: Vector) -> dict[int, Float[np.ndarray, "p k 3"]]:
+    def added(self, setting: Settings, x: Vector, y: Vector) -> dict[int, Vectors]:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
             acting = ((n, e) for n, e in self.acting.items() if acts_in(e, self.instrument, setting))
@@ -200,10 +201,10 @@ class AnalysisVectors:
         teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
 
-        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Values:
             return self.exact(setting, x, y, teff).reshape(len(x), -1)
 
-        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p t k 3"]) -> float:
+        def error(interpolated: Values, truth: Float[np.ndarray, "p t k 3"]) -> float:
             on_nodes = interpolated.reshape(len(interpolated), COLOURS + 1, self.cameras, 3)
             between = np.einsum("tc,pcks->ptks", weights, on_nodes)
             return float(np.abs(between - truth).max() / truth.max())
@@ -218,12 +219,12 @@ class AnalysisVectors:
         plain = plain_positions(self.instrument).size
         columns = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
 
-        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Values:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
             values = vector_slopes(self.instrument, plan, x, y)
             return np.moveaxis(values[:, columns][:, :, bands], 1, -1).reshape(len(x), -1)
 
-        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
+        def error(interpolated: Values, truth: Values) -> float:
             interpolated, truth = (values.reshape(-1, len(columns)) for values in (interpolated, truth))
             largest = np.abs(truth).max(axis=0)
             off = np.abs(interpolated - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)
@@ -235,16 +236,16 @@ class AnalysisVectors:
         filters = self.calibration.curves(setting)
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
-        def vectors(instrument: Instrument, x: Vector, y: Vector) -> Float[np.ndarray, "p k 3"]:
+        def vectors(instrument: Instrument, x: Vector, y: Vector) -> Vectors:
             return sky_vectors(instrument, plan_for_settings(instrument, flat, filters), x, y)[:, 0, :, :3]
 
-        def exact(x: Vector, y: Vector) -> Float[np.ndarray, "p f"]:
+        def exact(x: Vector, y: Vector) -> Values:
             """Change of the vectors in the order point, (effect, camera, Stokes)."""
             bare = vectors(self.instrument, x, y)
             changes = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
             return np.stack(changes, axis=1).reshape(len(x), -1)
 
-        def error(interpolated: Float[np.ndarray, "p f"], truth: Float[np.ndarray, "p f"]) -> float:
+        def error(interpolated: Values, truth: Values) -> float:
             return float(np.abs(interpolated - truth).max() / max(np.abs(truth).max(), 1e-300))
 
         return self._accurate(exact, DERIVATIVE_NODES, ADDED_TOLERANCE, error)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +43,7 @@ from walop_jax.fit.verdict import NOT_MEASURED, Hidden, Quality, Verdict
 from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
-from walop_jax.io.errors import DataError, nearest
+from walop_jax.io.errors import DataError, PathLike, nearest
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.dependence import left_behind, needs
@@ -61,6 +60,8 @@ if TYPE_CHECKING:
 
 Matrix = Float[np.ndarray, "n n"]
 Positions = Float[np.ndarray, " p"]  # deg
+Elements = Float[np.ndarray, "p m"]  # m21, m22, m23, m31, … at positions
+Covariances = Float[np.ndarray, "p m m"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
@@ -284,7 +285,7 @@ class Calibration(Contents, Fitted):
         return self.model.template
 
     @staticmethod
-    def read(path: str | os.PathLike[str]) -> Calibration:
+    def read(path: PathLike) -> Calibration:
         """The calibration of a product, or of the folder of a run. Raises `DataError` for what cannot be read."""
         from walop_jax.calibration.product import read_calibration
 
@@ -330,9 +331,7 @@ class Calibration(Contents, Fitted):
             m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
         return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
 
-    def _elements(
-        self, x: Positions, y: Positions, settings: Settings
-    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
+    def _elements(self, x: Positions, y: Positions, settings: Settings) -> tuple[Elements, Covariances]:
         filters = self.curves(settings)
         if self.draws is not None:
             drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
@@ -344,7 +343,7 @@ class Calibration(Contents, Fitted):
 
     def over_field(
         self, x: Positions, y: Positions, settings: Settings, counts: Sequence[int], tolerance: float
-    ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"], Float[np.ndarray, "p m n"]]:
+    ) -> tuple[Elements, Covariances, Float[np.ndarray, "p m n"]]:
         """Matrix, covariance and derivatives at many field positions (deg), interpolated (`slopes_over_field`).
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
@@ -409,7 +408,7 @@ class Calibration(Contents, Fitted):
         raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
-        self, x: Positions, y: Positions, settings: Settings, values: Float[np.ndarray, "p m"] | None = None
+        self, x: Positions, y: Positions, settings: Settings, values: Elements | None = None
     ) -> Int[np.ndarray, " p"]:
         """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
 

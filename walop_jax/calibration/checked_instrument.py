@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ import numpy as np
 from walop_jax.calibration.matrix import point_vectors
 from walop_jax.fit.model_file import model_without_data
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.errors import DataError
+from walop_jax.io.errors import DataError, PathLike
 from walop_jax.model.dependence import needs, optical_indices
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.elements.simple import Retarder
@@ -84,7 +83,7 @@ class CheckedInstrument(Displayed):
         )
 
 
-def checked(source: str | os.PathLike[str]) -> CheckedInstrument:
+def checked(source: PathLike) -> CheckedInstrument:
     """Read an instrument and send light through it; see `walop_jax.instrument` for errors."""
     design = Instrument.read(source, elements=defined_elements())
     requirements = needs(design)

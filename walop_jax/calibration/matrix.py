@@ -39,6 +39,8 @@ from walop_jax.model.specification import Model, series_indices
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
+Matrices = Float[np.ndarray, "p a 3"]  # point, arm, element
+Slopes = Float[np.ndarray, "p a 3 n"]  # in all parameters
 Filters = Mapping[str, FilterCurve]
 _MARK = 2.0**40
 """A value that no parameter has: it finds the amplitudes of effects among all parameters."""
@@ -203,7 +205,7 @@ def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) 
 # ----------------------------------------------------------------------------------------------------------- the matrix
 
 
-def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p a 3"]:
+def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Matrices:
     """Instrument matrices at field positions (deg) in the one setting of a plan."""
     return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
 
@@ -223,9 +225,7 @@ def of_matrix(
     return (added[..., i, :] - added[..., j, :] - common) / total
 
 
-def _matrix_and_slopes(
-    instrument: Instrument, plan: Plan
-) -> Callable[..., tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]]:
+def _matrix_and_slopes(instrument: Instrument, plan: Plan) -> Callable[..., tuple[Matrices, Slopes]]:
     """A function of rows as those of `_slopes_at`: matrices in the one band of the plan, and their derivatives."""
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
@@ -292,7 +292,7 @@ def matrix_draws(
 
 def matrix_slopes(
     instrument: Instrument, setting: Settings, filters: Filters, x: Vector, y: Vector
-) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
+) -> tuple[Matrices, Slopes]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
     `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
@@ -313,7 +313,7 @@ def slopes_over_field(
     covariance: Float[np.ndarray, "n n"],
     counts: Sequence[int],
     tolerance: float,
-) -> tuple[Float[np.ndarray, "p a 3"], Float[np.ndarray, "p a 3 n"]]:
+) -> tuple[Matrices, Slopes]:
     """`matrix_slopes` at many positions, interpolated where the optics are smooth.
 
     `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
@@ -379,7 +379,7 @@ def first_setting(calset: CalibrationSet, instrument: Instrument, exposure: int 
     return Settings.default(1, str(first.filter[0])).at(**first.positions)
 
 
-def instrument_matrices(result: FitResult) -> Float[np.ndarray, "p a 3"]:
+def instrument_matrices(result: FitResult) -> Matrices:
     """Instrument matrix at the field points of a fit, in the filter and plate setting of its first exposure."""
     instrument, calset = result.model.instrument(result.values), result.calset
     plan = plan_for_settings(instrument, first_setting(calset, instrument), calset.filters)

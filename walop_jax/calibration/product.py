@@ -8,7 +8,6 @@ otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs ar
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,7 +30,7 @@ from walop_jax.data.units import Place
 from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
 from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.errors import PathLike, errors_naming, fail
 from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.names import PRODUCT
 from walop_jax.io.text import in_ascii
@@ -96,9 +95,7 @@ Cards = dict[str, tuple[Any, str]]
 # ------------------------------------------------------------------------------------------------- writing
 
 
-def write_calibration(
-    path: str | os.PathLike[str], calibration: Calibration | Product, *, overwrite: bool = False
-) -> None:
+def write_calibration(path: PathLike, calibration: Calibration | Product, *, overwrite: bool = False) -> None:
     """Write a calibration, or the content of a file of one, with checksums; the file appears whole or not at all.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
@@ -284,7 +281,7 @@ def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
 # ------------------------------------------------------------------------------------------------- reading
 
 
-def read_calibration(run: str | os.PathLike[str], catalogue: Sequence[EffectKind] = EFFECTS) -> Calibration:
+def read_calibration(run: PathLike, catalogue: Sequence[EffectKind] = EFFECTS) -> Calibration:
     """Read and check a calibration, given by its file or by the folder of a run.
 
     `catalogue` are the effects that its model may have. Raises `DataError` as `read_product` does, and if the model
@@ -295,7 +292,7 @@ def read_calibration(run: str | os.PathLike[str], catalogue: Sequence[EffectKind
         return product.rebuilt(tuple(catalogue))
 
 
-def read_product(run: str | os.PathLike[str]) -> Product:
+def read_product(run: PathLike) -> Product:
     """Read and check the product of a fit, given by its file or by the folder of a run.
 
     Raises `DataError`, with advice, for a file that is damaged, of another kind, from a newer version of the format, or
@@ -305,7 +302,7 @@ def read_product(run: str | os.PathLike[str]) -> Product:
         return _Reader(opened).product()
 
 
-def product_path(run: str | os.PathLike[str]) -> Path:
+def product_path(run: PathLike) -> Path:
     """The file that a folder of a run, or the file itself, stands for."""
     path = Path(run)
     return path / PRODUCT if path.is_dir() else path

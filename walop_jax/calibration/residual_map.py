@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -80,18 +80,12 @@ def _point_sums(
     return jnp.concatenate([jnp.stack([chi2, freedom]), right, matrix])
 
 
-def _batch_sums(
-    instrument: Instrument,
-    plan: Plan,
-    chosen: Bool[Array, " e"],
-    data: engine.PointData,
-    nodes: FieldTable | None,
-) -> Float[Array, "p n"]:
-    sums = functools.partial(_point_sums, instrument, plan, chosen, nodes)
-    return jax.lax.map(sums, data, batch_size=limits.JACOBIAN_BLOCK)
-
-
-_sums = compiled(_batch_sums)
+@compiled
+def _sums(*given: Any) -> Float[Array, "p n"]:
+    """`_point_sums` of the points of a batch, which come last."""
+    return jax.lax.map(
+        functools.partial(_point_sums, *given[:-1]), given[-1], batch_size=limits.JACOBIAN_BLOCK
+    )
 
 
 def cells_for(points: int, census: Census) -> Grid:
@@ -147,7 +141,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | No
         batches = likelihood.points.slab(number)
         cell = np.concatenate([cell_of(grid, np.asarray(batch.x), np.asarray(batch.y)) for batch in batches])
         # Padded points carry no weight, hence zeros.
-        columns = [_sums(instrument, likelihood.plan, jnp.asarray(chosen), c, nodes) for c in batches]
+        columns = [_sums(instrument, likelihood.plan, jnp.asarray(chosen), nodes, c) for c in batches]
         sums = [np.bincount(cell, column, count) for column in np.concatenate(columns).T]
         return np.concatenate(sums)
 
@@ -158,8 +152,7 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | No
     matrices = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
     matrices[:, i, j] = matrices[:, j, i] = total[2 + n :].T
-    sums = _MapSums(chi2=total[0], freedom=total[1], right=total[2 : 2 + n], left=matrices)
-    return _solved_map(grid, setting, sums)
+    return _solved_map(grid, setting, total[0], total[1], total[2 : 2 + n], matrices)
 
 
 def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
@@ -191,34 +184,31 @@ def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
     sums = [in_blocks(values, together) for values in shaped]
     grid = cells.blocks(together, sums[0].shape)
     chi2, freedom, right, matrix = (values.reshape(*values.shape[:-2], -1) for values in sums)
-    return _solved_map(grid, setting, _MapSums(chi2, freedom, right, np.moveaxis(matrix, 2, 0)))
+    return _solved_map(grid, setting, chi2, freedom, right, np.moveaxis(matrix, 2, 0))
 
 
-class _MapSums(NamedTuple):
-    """Sums over the pixels of each cell: χ², degrees of freedom, Σ A r and Σ A P Aᵀ."""
-
-    chi2: Float[np.ndarray, " c"]
-    freedom: Float[np.ndarray, " c"]
-    right: Float[np.ndarray, "d c"]
-    left: Float[np.ndarray, "c d d"]
-
-
-def _solved_map(grid: Grid, setting: Settings, sums: _MapSums) -> ResidualMap:
-    """The map on a grid of cells at one setting, from its normal equations; NaN where these are singular."""
-    matrix, n = sums.left, len(sums.right)
+def _solved_map(
+    grid: Grid,
+    setting: Settings,
+    chi2: Float[np.ndarray, " c"],
+    freedom: Float[np.ndarray, " c"],
+    right: Float[np.ndarray, "d c"],
+    matrix: Float[np.ndarray, "c d d"],
+) -> ResidualMap:
+    """The map on a grid of cells at one setting, from Σ A r and Σ A P Aᵀ of each; NaN where these are singular."""
     size = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
     scaled = matrix / np.where(size > 0, size, 1.0)[:, :, None] / np.where(size > 0, size, 1.0)[:, None]
     regular = np.linalg.eigvalsh(scaled)[:, 0] > 1e-9
     inverse = np.full(matrix.shape, np.nan)
     inverse[regular] = np.linalg.inv(matrix[regular])
-    solution = np.einsum("cij,jc->ic", inverse, sums.right)
+    solution = np.einsum("cij,jc->ic", inverse, right)
     errors = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)).T
-    shape = (grid.height, grid.width)
+    shape = (len(right), grid.height, grid.width)
     return ResidualMap(
         grid=grid,
         filter=str(setting.filter[0]),
-        values=solution.reshape(n, *shape),
-        errors=errors.reshape(n, *shape),
-        chi2=(sums.chi2 / np.where(sums.freedom > 0, sums.freedom, np.nan)).reshape(shape),
+        values=solution.reshape(shape),
+        errors=errors.reshape(shape),
+        chi2=(chi2 / np.where(freedom > 0, freedom, np.nan)).reshape(shape[1:]),
         positions=setting.inside(),
     )

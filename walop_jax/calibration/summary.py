@@ -55,7 +55,7 @@ def summary(
         "noise_scale": result.noise_scale,
         "errors_from": result.errors_from,
         "steps": result.minimum.steps,
-        "starts": result.starts,
+        "starts": result.minimum.starts,
         "seconds_fit": result.seconds,
         "scaled_gradient": result.minimum.scaled_gradient,
         "condition_number": result.minimum.condition,

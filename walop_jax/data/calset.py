@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -37,7 +36,7 @@ from walop_jax.data.table_intensities import (
 )
 from walop_jax.data.units import Place, check_units, unit_of
 from walop_jax.data.write import EXTENSION, read_compression, remark, set_tables
-from walop_jax.io.errors import fail, nearest
+from walop_jax.io.errors import PathLike, fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
@@ -46,7 +45,7 @@ _NAN = float("nan")
 _SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
 
 
-def read_calibration_set(*paths: str | os.PathLike[str], kinds: Collection[str] = ()) -> CalibrationSet:
+def read_calibration_set(*paths: PathLike, kinds: Collection[str] = ()) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
     Whole frames are not read, only described; their blocks are checked as they are read. Oddities that are

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import re
 import typing
 from collections import ChainMap
@@ -37,10 +36,12 @@ from walop_jax.data.user_tables import (
     numeric_column,
     sky_positions,
 )
-from walop_jax.io.errors import DataError, errors_naming, rows_text
+from walop_jax.io.errors import DataError, PathLike, errors_naming, rows_text
 from walop_jax.io.fits_reading import open_fits
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
+
+Numbers = Float[np.ndarray, " n"]
 
 SHIPPED = ("sextractor", "photutils")
 BAD_PIXEL = int(DataFlag.BAD_PIXEL)
@@ -89,12 +90,12 @@ class CameraCatalogue:
     """
 
     path: Path
-    ra: Float[np.ndarray, " n"]
-    dec: Float[np.ndarray, " n"]
-    flux: Float[np.ndarray, " n"]
-    error: Float[np.ndarray, " n"]
+    ra: Numbers
+    dec: Numbers
+    flux: Numbers
+    error: Numbers
     flux_name: str
-    sky: Float[np.ndarray, " n"] | None
+    sky: Numbers | None
     flag: Int[np.ndarray, " n"]
     of_stars: Mapping[str, np.ndarray]
     of_exposure: Mapping[str, Any]
@@ -106,7 +107,7 @@ class CameraCatalogue:
         return len(self.ra)
 
 
-def read_map(source: str | os.PathLike[str]) -> ColumnMap:
+def read_map(source: PathLike) -> ColumnMap:
     """A map of columns that comes with the package, by name, or of a TOML file; `DataError` names a wrong key."""
     shipped = str(source) in SHIPPED
     text = (files("walop_jax.data") / f"{source}.toml").read_text("utf-8") if shipped else read_text(source)
@@ -129,10 +130,7 @@ def read_map(source: str | os.PathLike[str]) -> ColumnMap:
 
 
 def read_camera_catalogue(
-    path: str | os.PathLike[str],
-    columns: str | os.PathLike[str] | None = None,
-    gain: float | None = None,
-    words: Words | None = None,
+    path: PathLike, columns: PathLike | None = None, gain: float | None = None, words: Words | None = None
 ) -> CameraCatalogue:
     """The catalogue of a camera, by a map of columns (None: the one of those that come with the package that fits).
 
@@ -248,7 +246,7 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+) -> tuple[Numbers, Numbers, float]:
     """Fluxes and errors (electrons), and electrons per count; an error without a unit has that of its flux."""
     names = _pair(source, column_map.flux)
     unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
@@ -284,7 +282,7 @@ def _fluxes(
     return factor * flux, factor * error, factor
 
 
-def _plain_numbers(source: InputTable, name: str, place: Place) -> Float[np.ndarray, " n"]:
+def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
     """A column without its unit."""
     unitless = in_memory({name: np.ma.asarray(_one(source, name, place))}, str(source.path))
     return numeric_column(unitless, name.upper(), Column("float", missing=np.nan))
@@ -292,7 +290,7 @@ def _plain_numbers(source: InputTable, name: str, place: Place) -> Float[np.ndar
 
 def _positions(
     source: InputTable, column_map: ColumnMap, header: Mapping[str, Any], place: Place
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Numbers, Numbers]:
     """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
     names = _pair(source, (*column_map.sky, ("RA", "DEC")))
     pixels = _pair(source, column_map.pixel)

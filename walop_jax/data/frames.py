@@ -279,7 +279,11 @@ class RowReader:
             for array, stored in ((counts, stack.counts), (sigma, stack.sigma)):
                 for camera, cube in enumerate(stored):
                     _read(cube, start, stop, array[camera, rows])
-            closed[(rows, *inside)] = False if stack.flag is None else _is_set(stack.flag, start, stop)
+            if (flag := stack.flag) is None:
+                closed[(rows, *inside)] = False
+            else:  # an undefined flag, NaN, is no clean bill of health
+                plain = (flag.scale, flag.zero, flag.blank) == (1.0, 0.0, None)
+                closed[(rows, *inside)] = (flag.stored if plain else flag.rows)(start, stop) != 0
             first += stack.exposures
         return RawRows(jax.device_put(counts), jax.device_put(sigma), ~closed)
 
@@ -288,21 +292,12 @@ class RowReader:
         if not hasattr(self._own, "buffers"):
             frames = self.intensities
             cubes = [cube for stack in frames.stacks for cube in (*stack.counts, *stack.sigma)]
-            dtype = np.uint32 if all(_is_plain(cube) for cube in cubes) else np.float64
+            as_stored = all((cube.dtype, cube.scale, cube.zero) == (_WORDS, 1.0, 0.0) for cube in cubes)
+            dtype = np.uint32 if as_stored else np.float64
             shape = (frames.cameras, frames.exposures, *self.shape)
             counts, sigma = _zeros(shape, dtype), _zeros(shape, dtype)
             self._own.buffers = counts, sigma, np.ones(shape[1:], bool)
         return self._own.buffers
-
-
-def _is_plain(cube: Cube) -> bool:
-    return cube.dtype == _WORDS and (cube.scale, cube.zero) == (1.0, 0.0)
-
-
-def _is_set(flag: Cube, start: int, stop: int) -> Bool[np.ndarray, "e y x"]:
-    if (flag.scale, flag.zero, flag.blank) == (1.0, 0.0, None):
-        return flag.stored(start, stop) != 0  # whatever the order of the bytes
-    return flag.rows(start, stop) != 0  # an undefined flag, NaN, is no clean bill of health
 
 
 def _read(cube: Cube, start: int, stop: int, into: np.ndarray) -> None:

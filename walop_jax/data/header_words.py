@@ -11,7 +11,6 @@ import dataclasses
 import json
 import math
 import operator
-import os
 import re
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
 from walop_jax.data.units import Place, convert_unit, degrees_of, is_sexagesimal, mjd_of
-from walop_jax.io.errors import errors_naming, fail, nearest
+from walop_jax.io.errors import PathLike, errors_naming, fail, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader
 
@@ -75,7 +74,7 @@ class Words:
     schedule: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
-def read_words(path: str | os.PathLike[str]) -> Words:
+def read_words(path: PathLike) -> Words:
     """The words in a file. Raises `DataError` for a column that EXPOSURES do not have, and for unknown keys."""
     with errors_naming(path):
         return words_of(parse_toml(read_text(path)))
@@ -110,7 +109,7 @@ def words_of(content: Mapping[str, Any]) -> Words:
 
 
 def exposures_table(
-    paths: Sequence[str | os.PathLike[str]], words: Words, content: Any = None
+    paths: Sequence[PathLike], words: Words, content: Any = None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns of EXPOSURES, one row for each exposure in the files, their names in FILE; and remarks.
 
@@ -166,7 +165,7 @@ def overlapping(mjd: np.ndarray, exptime: np.ndarray) -> int:
 
 
 def of_header(
-    header: Mapping[str, Any], words: Words, names: Collection[str], file: str | os.PathLike[str]
+    header: Mapping[str, Any], words: Words, names: Collection[str], file: PathLike
 ) -> dict[str, Any]:
     """The columns `names` that `words` make of one header, those that have a word."""
     stated = {name: word for name, word in words.columns.items() if name in names}
@@ -203,7 +202,7 @@ def _records(path: Path, words: Words, content: Any) -> Iterator[Mapping[str, An
         yield from (dict(zip(table.colnames, row, strict=True)) for row in table.iterrows())
 
 
-def json_content(path: str | os.PathLike[str]) -> Any:
+def json_content(path: PathLike) -> Any:
     """The content of a JSON file, a list where it has a record in each line."""
     text = read_text(path)
     try:

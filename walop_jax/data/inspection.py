@@ -123,18 +123,7 @@ class Inspection(Displayed):
             "standards": ", ".join(self.sources) or "none",
             "filters": ", ".join(self.filters),
         }
-        rows = (
-            (
-                g.kind,
-                g.filter,
-                g.calibration_plate,
-                g.teff,
-                g.exposures,
-                g.angles or "",
-                f"{100 * g.used:.0f} %",
-            )
-            for g in self.groups
-        )
+        rows = ((*dataclasses.astuple(g)[:5], g.angles or "", f"{100 * g.used:.0f} %") for g in self.groups)
         return Display(
             title=", ".join(self.files) or "in memory",
             facts=tuple(facts.items()),
@@ -169,7 +158,12 @@ def inspect(calset: CalibrationSet) -> Inspection:
         field=(float(points.x.min()), float(points.x.max()), float(points.y.min()), float(points.y.max())),
         angles=tuple(angles.tolist()),
         widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
-        elements=tuple(_element_use(e, prefix, live) for prefix in e.further),
+        elements=tuple(
+            ElementUse(
+                prefix, int(at.inside.sum()), tuple(np.unique(np.round(at.angle[at.inside], 3)).tolist())
+            )
+            for prefix, at in e[live].further.items()
+        ),
         looked_at=len(used),
         rows=int(used.sum()),
         possible=int(used.size),
@@ -203,13 +197,6 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
         angles = np.unique(np.round(e.clp_angle[rows][e.clp_in[rows]], 3))
         groups.append(Group(*key, len(rows), len(angles), float(share[rows].mean())))
     return tuple(groups)
-
-
-def _element_use(exposures: Exposures, prefix: str, live: np.ndarray) -> ElementUse:
-    """The use of a moving element in the exposures with data."""
-    position = exposures.position(prefix)[np.flatnonzero(live)]
-    angles = np.unique(np.round(position.angle[position.inside], 3))
-    return ElementUse(prefix, int(position.inside.sum()), tuple(angles.tolist()))
 
 
 def _flags(calset: CalibrationSet) -> dict[str, int]:

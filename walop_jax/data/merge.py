@@ -243,7 +243,13 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
         if owner[at] != file:
             star[star == i] = at
     values = np.stack([columns[name] for name in ("q", "u", "q_err", "u_err", "scatter")], axis=1)
-    band = _bands_of(sets, star, owner, values, columns["filter"])
+    # Of stars with different values: the band in which their file saw its stars.
+    filters = [np.unique(entry.exposures.filter[entry.exposures.direct("standard")]) for entry in sets]
+    filter_of_file = np.array([names[0] if len(names) == 1 else "" for names in filters])
+    unclear = np.array([not _equal(values[star == number]) for number in star], bool) & (
+        columns["filter"] == ""
+    )
+    band = np.where(unclear, filter_of_file[owner], columns["filter"])
     rows_kept: list[int] = []
     for row in range(len(star)):
         same = [k for k in rows_kept if star[k] == star[row] and band[k] == band[row]]
@@ -262,20 +268,6 @@ def _join_sources(sets: tuple[CalibrationSet, ...]) -> tuple[Sources, list[np.nd
 
 def _equal(rows: np.ndarray) -> bool:
     return all(np.array_equal(rows[0], row, equal_nan=True) for row in rows)
-
-
-def _bands_of(
-    sets: tuple[CalibrationSet, ...],
-    star: np.ndarray,
-    owner: np.ndarray,
-    values: np.ndarray,
-    stated: np.ndarray,
-) -> np.ndarray:
-    """The bands of values: as stated, and of stars with different values that in which their file saw its stars."""
-    filters = [np.unique(entry.exposures.filter[entry.exposures.direct("standard")]) for entry in sets]
-    filter_of_file = np.array([names[0] if len(names) == 1 else "" for names in filters])
-    differ = [not _equal(values[star == number]) for number in star]
-    return np.where((stated == "") & np.array(differ, bool), filter_of_file[owner], stated)
 
 
 def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:

@@ -12,7 +12,6 @@ import datetime
 import itertools
 import json
 import math
-import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -22,7 +21,7 @@ from walop_jax.data.header_words import columns_of, json_content, overlapping
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Exposures, Position, Site
 from walop_jax.data.units import degrees_of, mjd_of, sexagesimal
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 from walop_jax.io.text import some
 from walop_jax.io.toml import Reader
 
@@ -62,7 +61,11 @@ def schedule_of(
     remarks = list[str]()
     _check(exposures, filters)
     each = [exposures[e : e + 1] for e in range(len(exposures))]
-    rows = [_acquired(exposure, filters) for exposure in each]
+    rows = []
+    for e, exposure in enumerate(each):
+        seconds = max(round(float(exposures.exptime[e])), 1)
+        states = {word: _state(exposure.positions[p], seconds, p) for p, word in ELEMENTS.items()}
+        rows.append((seconds, {"filter": filters[str(exposures.filter[e])], **states}))
     rounded = [float(t) for t in exposures.exptime if t != round(t) or t < 1]
     if rounded:
         remarks.append(f"{len(rounded)} exposure times are no whole seconds ({rounded[0]:g} s): rounded")
@@ -93,7 +96,7 @@ def schedule_of(
 
 
 def read_schedule(
-    path: str | os.PathLike[str], filters: Mapping[str, int], content: Any = None
+    path: PathLike, filters: Mapping[str, int], content: Any = None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns of EXPOSURES of a schedule, the names of their targets in TARGET, and remarks.
 
@@ -145,13 +148,6 @@ def _check(exposures: Exposures, filters: Mapping[str, int]) -> None:
         raise fail("is not known", column="EXPTIME", advice="a schedule needs the time of every exposure")
     if not np.isfinite(exposures.mjd).any():
         raise fail("no exposure has a time", column="MJD", advice="a schedule needs the date of its night")
-
-
-def _acquired(one: Exposures, filters: Mapping[str, int]) -> tuple[int, dict[str, Any]]:
-    """Seconds of a single exposure, and its setting."""
-    seconds = max(round(float(one.exptime[0])), 1)
-    states = {word: _state(one.positions[prefix], seconds, prefix) for prefix, word in ELEMENTS.items()}
-    return seconds, {"filter": filters[str(one.filter[0])], **states}
 
 
 def _state(at: Position, seconds: int, prefix: str) -> dict[str, Any]:

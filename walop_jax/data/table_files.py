@@ -38,7 +38,8 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
     them by name or number) and between separators of a text. Raises `DataError` if the file is missing, damaged or no
     table.
     """
-    path, extension = _extension_of(path)
+    bracket = None if path.exists() else re.fullmatch(r"(.+)\[([^\[\]]+)\]", str(path))
+    path, extension = (path, "") if bracket is None else (Path(bracket[1]), bracket[2].strip())
     path = check_input(path)
     from astropy.table import Table  # imported here: it takes a third of a second
 
@@ -72,12 +73,6 @@ def read_table_file(path: Path, needed: Collection[str]) -> tuple[Path, Any, tup
     except UNREADABLE as error:
         what = f"cannot be read as a table: {one_line(error)}"
         raise fail(what, file=path, advice="write it again") from error
-
-
-def _extension_of(path: Path) -> tuple[Path, str]:
-    """The file, and the extension that is named in brackets behind it."""
-    match = re.fullmatch(r"(.+)\[([^\[\]]+)\]", str(path))
-    return (path, "") if match is None or path.exists() else (Path(match[1]), match[2].strip())
 
 
 def _format(path: Path) -> str:

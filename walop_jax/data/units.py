@@ -121,7 +121,7 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
     target = units.Unit(wanted)
     if unit_given == target:
         return values  # no arithmetic: values come back bit for bit
-    if _is_logarithmic(unit_given):
+    if hasattr(unit_given, "physical_unit") or unit_given in (units.mag, units.dex, units.dB):
         advice = f"give the column in {wanted or 'fractions'}"
         if wanted in ("electron", "ct"):
             advice = (
@@ -141,8 +141,3 @@ def convert_unit(values: np.ndarray, unit: str, wanted: str, name: str, place: P
             per_time = unit_given.is_equivalent(target / units.s)
             advice += f" (multiply by the {'exposure time' if per_time else 'gain'})"
         raise place.fail(what, name, advice) from error
-
-
-def _is_logarithmic(unit: Any) -> bool:
-    """True for mag, dex and dB, alone or of something: mag(electron)."""
-    return hasattr(unit, "physical_unit") or unit in (units.mag, units.dex, units.dB)

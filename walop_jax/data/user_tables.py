@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import os
 import re
 from collections.abc import Collection, Mapping, Sequence, Set
 from pathlib import Path
@@ -20,7 +19,7 @@ from jaxtyping import Bool, Float
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
 from walop_jax.data.units import Place, check_units, degrees_of, is_sexagesimal, partner_of, unit_of
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 from walop_jax.io.fits_reading import one_line
 from walop_jax.io.text import in_ascii, some
 
@@ -114,7 +113,7 @@ def _columns(names: Sequence[str]) -> str:
     return f"column{'s' if len(names) > 1 else ''} {', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
-def read_input_table(path: str | os.PathLike[str], needed: Collection[str] = ("X", "Y")) -> InputTable:
+def read_input_table(path: PathLike, needed: Collection[str] = ("X", "Y")) -> InputTable:
     """Read a table with whatever columns it has; those `needed` (in capitals) tell it from others in its file.
 
     Raises `DataError` if the file is missing, damaged, no table, has no rows, or names a column twice.

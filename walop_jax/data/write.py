@@ -6,9 +6,7 @@ The extension COMPRESSION describes the whole frames for whose pixels a calibrat
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from walop_jax.data.records import CalibrationSet, Compression, InputFile
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
+from walop_jax.io.errors import PathLike
 
 EXTENSION, _AGAIN = "COMPRESSION", "compress the frames again"
 MOST_EXPOSURES = 1_000_000  # of a run that a header may claim
@@ -39,7 +38,9 @@ def compression_hdu(found: Compression, path: object) -> fits.BinTableHDU:
         hdu.header["STRUCTG"] = (found.gain, "rms gain of a camera at a pixel")
         hdu.header["STRUCTR"] = (found.response, "rms response of a camera to q, u there")
     if found.exposures is not None:
-        hdu.header["EXPOSURE"] = _in_runs(found.exposures)
+        ordered = np.unique(np.array([*found.exposures], int))
+        runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+        hdu.header["EXPOSURE"] = ",".join(f"{run[0]}:{run[-1]}" for run in runs if len(run))
     for number, entry in enumerate(found.frames, start=1):
         hdu.header[f"FILE{number}"] = str(entry.path.name)
         hdu.header[f"SHA{number}"] = entry.sha256
@@ -75,15 +76,8 @@ def read_compression(hdu: Any, path: Path) -> Compression:
     )
 
 
-def _in_runs(numbers: Iterable[int]) -> str:
-    """Whole numbers as runs, the first and the last of each: "0:23,40:41"."""
-    ordered = np.unique(np.array([*numbers], int))
-    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-    return ",".join(f"{run[0]}:{run[-1]}" for run in runs if len(run))
-
-
 def _of_runs(text: object, place: Place) -> tuple[int, ...]:
-    """The whole numbers of runs; `DataError` for texts that are none."""
+    """The whole numbers of runs, "0:23,40:41"; `DataError` for texts that are none."""
     runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
     ends = [(int(run[1]), int(run[2])) for run in runs if run]
     if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
@@ -107,9 +101,7 @@ def remark(found: Compression, points: int) -> str:
 # -------------------------------------------------------------------------------------------------- tables
 
 
-def write_calibration_set(
-    path: str | os.PathLike[str], calset: CalibrationSet, *, overwrite: bool = False
-) -> None:
+def write_calibration_set(path: PathLike, calset: CalibrationSet, *, overwrite: bool = False) -> None:
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
     Data that were read come back bit for bit, rows that are not used included; other intensities (frames, say)

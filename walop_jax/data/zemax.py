@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import re
 from collections.abc import Callable, Sequence
 from decimal import Decimal
@@ -39,7 +38,7 @@ from walop_jax.data.calset import from_arrays
 from walop_jax.data.records import CalibrationSet, DataFlag, FilterCurve, Site
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import described, shipped
-from walop_jax.io.errors import DataError, errors_naming, fail
+from walop_jax.io.errors import DataError, PathLike, errors_naming, fail
 from walop_jax.io.text import check_input
 
 HEADING = "Polarization Transmission Data"
@@ -86,7 +85,7 @@ class _Block:
     total: Decimal | None = None
 
 
-def read_export(path: str | os.PathLike[str]) -> TransmissionExport | None:
+def read_export(path: PathLike) -> TransmissionExport | None:
     """Read one text export; None for a text that does not begin like one.
 
     UTF-8, UTF-16 with its mark and the one-byte encodings of Windows are read, with any line ends and with a
@@ -169,7 +168,12 @@ def _blocks(lines: list[str], start: int, path: Path) -> list[_Block]:
         if line.startswith("Field Pos"):
             if blocks:
                 _check(blocks[-1], path)
-            blocks.append(_Block(n, _position(line, path, n)))
+            match = _POSITION.fullmatch(line)
+            if not match or match[3] != "deg":
+                advice = "export field angles in degrees, X and Y"
+                raise _fault(path, n, f"{line!r} is not a pair of angles", advice)
+            x, y = (float(_number(match[k], "the position", path, n)) + 0.0 for k in (1, 2))
+            blocks.append(_Block(n, (x, y)))
             if any(block.position == blocks[-1].position for block in blocks[:-1]):
                 raise _fault(path, n, "the field point is there twice", "give each field point once")
         elif match := _VALUE.fullmatch(line):
@@ -188,14 +192,6 @@ def _blocks(lines: list[str], start: int, path: Path) -> list[_Block]:
         raise _fault(path, len(lines), "ends ahead of its part on chief rays: it is cut off", _AGAIN)
     _check(blocks[-1], path)
     return blocks
-
-
-def _position(line: str, path: Path, n: int) -> tuple[float, float]:
-    match = _POSITION.fullmatch(line)
-    if not match or match[3] != "deg":
-        raise _fault(path, n, f"{line!r} is not a pair of angles", "export field angles in degrees, X and Y")
-    x, y = (float(_number(match[k], "the position", path, n)) + 0.0 for k in (1, 2))
-    return x, y
 
 
 def _check(block: _Block, path: Path) -> None:
@@ -230,7 +226,7 @@ _CAMERA_NAMES = ("O1", "E1", "O2", "E2")
 
 
 def import_transmissions(
-    folder: str | os.PathLike[str],
+    folder: PathLike,
     *,
     instrument: str | None = None,
     configurations: Sequence[int] = CAMERA_CONFIGURATIONS,

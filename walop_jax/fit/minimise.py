@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -70,22 +70,26 @@ class Quadratic(Protocol):
         ...
 
 
+Place = TypeVar("Place", bound=Quadratic)
+
+
 @dataclasses.dataclass(frozen=True)
-class Minimum:
+class Minimum(Generic[Place]):
     """End of a search: `x` in the units it was given, the expansion there and the gates.
 
     `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
-    `optimistix.RESULTS`, and `message` says it in words.
+    `optimistix.RESULTS`, and `message` says it in words. It was sought from so many `starts`.
     """
 
     x: Vector
-    expansion: Quadratic
+    expansion: Place
     result: optx.RESULTS
     message: str
     steps: int
     scaled_gradient: float
     condition: float
     history: tuple[float, ...]
+    starts: int = 1
 
     @property
     def converged(self) -> bool:
@@ -94,16 +98,16 @@ class Minimum:
 
 
 def minimise(
-    evaluate: Callable[[Vector], Quadratic],
+    evaluate: Callable[[Vector], Place],
     start: Vector,
     scale: Vector,
     *,
     damping: float = 1.0,
     maximum_steps: int = MAXIMUM_STEPS,
     tolerance: float = TOLERANCE,
-    far_off: Callable[[Any], bool] = lambda _: False,
-    progress: Callable[[int, Any], None] | None = None,
-) -> Minimum:
+    far_off: Callable[[Place], bool] = lambda _: False,
+    progress: Callable[[int, Place], None] | None = None,
+) -> Minimum[Place]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
     `evaluate(x)` gives the objective and its expansion at x, `far_off` whether the model of an expansion is hopelessly

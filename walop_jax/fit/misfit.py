@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from os import PathLike
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Position
 from walop_jax.fit.outliers import BEYOND, MOST, outlying
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.errors import PathLike
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
@@ -59,7 +59,7 @@ class Misfit:
         advice = "if these are cosmic rays or stars, walop-jax clip flags them"
         return (f"{share}: {advice}",) if 0.0 < self.outliers <= MOST else ()
 
-    def reasons(self, warnings: Sequence[str], folder: str | PathLike[str] | None) -> tuple[str, ...]:
+    def reasons(self, warnings: Sequence[str], folder: PathLike | None) -> tuple[str, ...]:
         """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
         reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
         omitted = len(reasons) - MOST_REASONS

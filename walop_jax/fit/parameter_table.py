@@ -15,8 +15,6 @@ from walop_jax.model.effects import Deviations
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import THROUGHPUT, Model, Vector
 
-Columns = dict[str, tuple[np.ndarray, str, str]]
-
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
 PRIOR_WORDS = "prior only"
 MOST_LISTED = 6  # parameters by name, in a note
@@ -80,20 +78,15 @@ def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
 def parameter_table(model: Model, values: Vector, sigma: Vector) -> Any:
     """An astropy table with a row for every parameter; errors of fixed ones are 0, priors NaN where there is none."""
     idle = unconstrained(model, sigma)
-    priors = np.array([p.prior or (np.nan, np.nan) for p in model.parameters]).reshape(-1, 2)
-    states = [_state(p, idle) or "free" for p in model.parameters]
-    columns: Columns = {
-        "NAME": (np.array(model.names), "", "parameter"),
+    columns = model.columns()
+    states = np.array([_state(p, idle) or "free" for p in model.parameters])
+    fitted = {
+        "NAME": columns["NAME"],
         "VALUE": (np.asarray(values), "", "fitted value, or the one that it was held at"),
         "SIGMA": (np.asarray(sigma), "", "standard error"),
-        "UNIT": (np.array([p.unit for p in model.parameters]), "", "unit of the numbers of this row"),
-        "START": (model.start, "", "start value"),
-        "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
-        "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
-        "STATE": (np.array(states), "", "free, fixed, tied to another, or known from its prior only"),
-        "ABOUT": (np.array([p.about for p in model.parameters]), "", "meaning"),
     }
-    return astropy_table(columns)
+    state = {"STATE": (states, "", "free, fixed, tied to another, or known from its prior only")}
+    return astropy_table(fitted | columns | state)
 
 
 def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[str, ...], ...]:

@@ -68,8 +68,7 @@ class FitResult(Fitted):
     values: Vector
     covariance: Matrix
     expansion: Expansion
-    minimum: Minimum
-    starts: int
+    minimum: Minimum[Expansion]
     seconds: float
     errors_from: str = STATED
     verdict: Verdict | None = None
@@ -261,21 +260,20 @@ def fit(
     best = find_minimum(likelihood, first, noise_scale, worth)
     for _ in range(LAYOUTS):
         # Retarders that a fit has made thicker need more wavelengths than those that it began with.
-        before, likelihood = likelihood, likelihood.following(best.values)
+        before, likelihood = likelihood, likelihood.following(best.x)
         if likelihood is before:
             break
-        best = find_minimum(likelihood, best.values, noise_scale, worth)
+        best = find_minimum(likelihood, best.x, noise_scale, worth)
     if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
         what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
         them = "it" if len(idle) == 1 else "them"
         raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
     return FitResult(
         likelihood=likelihood,
-        values=best.values,
+        values=best.x,
         covariance=covariance(model, best.expansion),
         expansion=best.expansion,
-        minimum=best.minimum,
-        starts=best.starts,
+        minimum=best,
         seconds=time.perf_counter() - began,
     )
 

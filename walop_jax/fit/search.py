@@ -29,6 +29,7 @@ PIXEL_SAMPLE = 1024
 """Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
 
 Expand = Callable[[Vector, float, Expansion | None], Expansion]
+Found = Minimum[Expansion]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
@@ -37,26 +38,6 @@ OTHER_STEPS = 12  # of a start one order of retardance away
 MOST_ORDERS = 8  # times that fringes of air are tried some orders away from the best so far
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
-
-
-@dataclasses.dataclass(frozen=True)
-class FoundMinimum:
-    """A minimum, the values of all parameters there, and from how many places it was sought."""
-
-    minimum: Minimum
-    values: Vector
-    starts: int = 1
-
-    @property
-    def expansion(self) -> Expansion:
-        """The expansion at the minimum."""
-        assert isinstance(self.minimum.expansion, Expansion)
-        return self.minimum.expansion
-
-    @property
-    def misfit(self) -> float:
-        """`Expansion.misfit` at the minimum."""
-        return self.expansion.misfit
 
 
 def free_scales(model: Model) -> Vector:
@@ -78,8 +59,8 @@ def _search(
     expand: Expand | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
-) -> FoundMinimum:
-    """The minimum from a full vector of start values; `near` is an expansion at similar ones, if there is any.
+) -> Found:
+    """The minimum from a full vector of start values, its `x` full as well; `near` is an expansion at similar ones.
 
     `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
     """
@@ -102,7 +83,7 @@ def _search(
         progress=tell,
         **how,
     )
-    return FoundMinimum(minimum, model.full(minimum.x, first))
+    return dataclasses.replace(minimum, x=model.full(minimum.x, first))
 
 
 def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
@@ -111,12 +92,12 @@ def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
     They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
     """
     how = {"maximum_steps": FIRST_STEPS, "tolerance": distance}
-    return _search(likelihood, "closer to the data", values, 1.0, **how).values
+    return _search(likelihood, "closer to the data", values, 1.0, **how).x
 
 
 def find_minimum(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> FoundMinimum:
+) -> Found:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
     The sample of a very large set is large itself. Of whole frames some strips of image rows come between the sample
@@ -141,22 +122,22 @@ def find_minimum(
             return expand_pixels(likelihood, values, scale, stride)
 
         how = {"expand": of_pixels if on_pixels else None, "tolerance": tolerance, "damping": 0.0}
-        best = _search(likelihood, label, best.values, scale, **how)
+        best = _search(likelihood, label, best.x, scale, **how)
     return dataclasses.replace(best, starts=starts)
 
 
-def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
+def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
     """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
 
     Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
     own. Steps go on while they lower the objective.
     """
     model, quarter = likelihood.model, 0.25 * float(np.asarray(likelihood.plan.wavelength).mean())
-    for gap in model.gaps() if best.minimum.converged else ():
+    for gap in model.gaps() if best.converged else ():
         for _ in range(MOST_ORDERS):
             before = best
             for order in (-2, -1, 1, 2):
-                start = before.values.copy()
+                start = before.x.copy()
                 start[gap] += order * quarter
                 if start[gap] <= 0:
                     continue
@@ -164,51 +145,51 @@ def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
                 scale = before.expansion.noise_scale
                 trial = _search(likelihood, label, start, scale, before.expansion, maximum_steps=OTHER_STEPS)
                 best = dataclasses.replace(best, starts=best.starts + 1)
-                if trial.minimum.converged and trial.expansion.objective < best.expansion.objective:
+                if trial.converged and trial.expansion.objective < best.expansion.objective:
                     best = dataclasses.replace(trial, starts=best.starts)
-            if best.minimum is before.minimum:
+            if best.x is before.x:
                 break
     return best
 
 
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> FoundMinimum:
+) -> Found:
     """The minimum from start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
-    promising = best.expansion.objective < worth if worth is not None else best.misfit < FAR_OFF
-    if not best.minimum.converged and promising:
-        best = _search(likelihood, "fit, continued", best.values, scale, best.expansion, damping=0.0)
-    if noise_scale is not None or best.misfit < FAR_OFF:
+    promising = best.expansion.objective < worth if worth is not None else best.expansion.misfit < FAR_OFF
+    if not best.converged and promising:
+        best = _search(likelihood, "fit, continued", best.x, scale, best.expansion, damping=0.0)
+    if noise_scale is not None or best.expansion.misfit < FAR_OFF:
         return best
     return _far_off(likelihood, best)
 
 
-def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
+def _far_off(likelihood: Likelihood, best: Found) -> Found:
     """The best minimum of a model far from its data: errors scaled to the residuals, plates a wave off tried."""
-    budget, starts = most_passes(likelihood.model) - best.minimum.steps, 1
+    budget, starts = most_passes(likelihood.model) - best.steps, 1
 
-    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
+    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> Found:
         nonlocal budget
         maximum_steps = max(1, min(maximum_steps, budget))
         attempt = _search(likelihood, label, values, scale, best.expansion, maximum_steps=maximum_steps)
-        budget -= attempt.minimum.steps
+        budget -= attempt.steps
         return attempt
 
-    def rescaled(best: FoundMinimum) -> FoundMinimum:
+    def rescaled(best: Found) -> Found:
         for _ in range(MAXIMUM_RESCALINGS):
-            scale = float(np.sqrt(best.misfit)) if best.misfit > FAR_OFF else 1.0
+            scale = float(np.sqrt(best.expansion.misfit)) if best.expansion.misfit > FAR_OFF else 1.0
             if budget <= 0 or abs(scale / best.expansion.noise_scale - 1.0) < 0.1:
                 break
             # Half of the budget at most: the other orders are to be tried as well.
             label = f"the model is far off; errors × {scale:.3g}"
-            best = search(label, best.values, scale, max(FIRST_STEPS, budget // 2))
+            best = search(label, best.x, scale, max(FIRST_STEPS, budget // 2))
         return best
 
     best = rescaled(best)
-    starts_left = list(_order_starts(likelihood)) if best.misfit > FAR_OFF else []
+    starts_left = list(_order_starts(likelihood)) if best.expansion.misfit > FAR_OFF else []
     for number, (label, first_values) in enumerate(starts_left, start=2):
         if budget <= 0:
             break
@@ -216,18 +197,17 @@ def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
         trial, starts = search(label, first_values, best.expansion.noise_scale, OTHER_STEPS), starts + 1
         if trial.expansion.objective < best.expansion.objective:
             best = rescaled(trial)
-    if not best.minimum.converged and budget > 0:
-        best = search("the best of them", best.values, best.expansion.noise_scale, budget)
-    minimum = best.minimum
-    if not minimum.converged and best.misfit > FAR_OFF:
+    if not best.converged and budget > 0:
+        best = search("the best of them", best.x, best.expansion.noise_scale, budget)
+    if not best.converged and (misfit := best.expansion.misfit) > FAR_OFF:
         passes = most_passes(likelihood.model) - budget
         message = (
-            f"given up after {passes} steps from {starts} starts: χ²/dof stays near {best.misfit:.3g}, and more steps "
+            f"given up after {passes} steps from {starts} starts: χ²/dof stays near {misfit:.3g}, and more steps "
             "buy nothing; check the columns of the set, INSTRUME and the description of the instrument, or look for "
             "missing effects (walop-jax diagnose)"
         )
-        minimum = dataclasses.replace(minimum, message=message)
-    return dataclasses.replace(best, minimum=minimum, starts=starts)
+        best = dataclasses.replace(best, message=message)
+    return dataclasses.replace(best, starts=starts)
 
 
 def check_identifiable(likelihood: Likelihood) -> None:

@@ -16,7 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from walop_jax.io.errors import DataError, nearest
+from walop_jax.io.errors import DataError, PathLike, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import Reader, Table
 
@@ -100,7 +100,7 @@ def _shipped_text(name: str) -> str:
     return (resources.files("walop_jax.instruments") / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def read_description(source: str | os.PathLike[str]) -> Description:
+def read_description(source: PathLike) -> Description:
     """The description in a file, or a shipped one by name.
 
     Raises `DataError` naming the file, the table and the key that is wrong, and what to write instead.

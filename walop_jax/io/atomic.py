@@ -15,10 +15,10 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError, PathLike, fail
 
 
-def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def check_output(path: PathLike, *, overwrite: bool = False) -> Path:
     """Return the file that `path` leads to, or say why nothing can be written there.
 
     Meant to be called before hours of work as well as before the writing itself. A symbolic link is
@@ -50,7 +50,7 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Pa
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+def atomic_path(path: PathLike, *, overwrite: bool = False) -> Iterator[Path]:
     """Give a temporary file to write; put it in the place of `path` only if the block ends well.
 
     The temporary file lies in the same folder (a rename across file systems is a copy, hence not atomic)

@@ -13,13 +13,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 
 T = TypeVar("T")
 _OF_USERS = "walop_jax_own_"  # modules made of files of users
 
 
-def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict[str, type[T]]:
+def classes_of(path: PathLike, base: type[T], advice: str) -> dict[str, type[T]]:
     """The subclasses of `base` that a Python file defines, by name, in the order of the file.
 
     The file is run. Raises `DataError`, with `advice` where there is no such file, and if it fails when it is run.
@@ -32,7 +32,7 @@ def classes_of(path: str | os.PathLike[str], base: type[T], advice: str) -> dict
     }
 
 
-def run_file(path: str | os.PathLike[str], advice: str) -> ModuleType:
+def run_file(path: PathLike, advice: str) -> ModuleType:
     """A Python file of a user, run as a module. Raises `DataError` as `classes_of` does."""
     path = Path(path)
     if not path.is_file():

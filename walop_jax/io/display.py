@@ -7,12 +7,12 @@ import dataclasses
 import html
 import importlib
 import itertools
-import os
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 from walop_jax.io.code import blank
+from walop_jax.io.errors import PathLike
 
 MOST_LINES = 25
 """Largest number of lines of the `repr` of a result."""
@@ -139,10 +139,10 @@ class Result(Drawn):
 
     first_figure = "matrix"
 
-    def report(self, output: str | os.PathLike[str], **options: Any) -> Any:
+    def report(self, output: PathLike, **options: Any) -> Any:
         """Write the page about it."""
         return importlib.import_module("walop_jax").report(self, output, **options)
 
-    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    def save(self, folder: PathLike, *, overwrite: bool = False) -> None:
         """Write it as the folder of a run, which every command reads."""
         importlib.import_module("walop_jax")._save(self, folder, overwrite=overwrite)

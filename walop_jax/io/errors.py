@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
+PathLike = str | os.PathLike[str]
 _SHOWN = 5
 """Number of rows or names that a message spells out before it only counts the rest."""
 _ALIKE, _SHORT = 0.75, 3
@@ -44,7 +45,7 @@ def printable(text: str) -> str:
 
 
 @contextlib.contextmanager
-def errors_naming(path: str | os.PathLike[str] | None) -> Iterator[None]:
+def errors_naming(path: PathLike | None) -> Iterator[None]:
     """Put the name of a file at the head of every ValueError of the block that does not hold it; None: of no file."""
     try:
         yield

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError, PathLike, fail
 from walop_jax.io.text import check_input, unpacking
 
 _CHUNK = 1 << 23  # a multiple of four, so that words never straddle two chunks
@@ -56,7 +56,7 @@ class OpenFile:
 
 
 @contextlib.contextmanager
-def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterator[OpenFile]:
+def open_fits(path: PathLike, advice: str | None = None) -> Iterator[OpenFile]:
     """Open a FITS file (plain, or packed with gzip, bzip2, xz or zip) after checking that it is whole.
 
     A file without checksums is remarked on: damage to it cannot be noticed. Raises `DataError` as `check_input` and
@@ -100,7 +100,7 @@ def open_fits(path: str | os.PathLike[str], advice: str | None = None) -> Iterat
             raise fail(f"cannot be read: {one_line(error)}", file=path, advice=advice) from error
 
 
-def primary_keywords(path: str | os.PathLike[str]) -> tuple[str, ...]:
+def primary_keywords(path: PathLike) -> tuple[str, ...]:
     """Keywords of the primary header, unchecked, which tell the kind of a file; none if it is no FITS file."""
     try:
         packed = unpacking(check_input(path))

@@ -16,10 +16,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from walop_jax.io import atomic
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import DataError, PathLike, fail
 
 
-def check_folder(path: str | os.PathLike[str], names: Sequence[str] = (), *, overwrite: bool = False) -> Path:
+def check_folder(path: PathLike, names: Sequence[str] = (), *, overwrite: bool = False) -> Path:
     """Return the folder that results may be put in, or say why not; it need not exist yet.
 
     Meant to be called before the work as well as before the writing. Raises `DataError` if its parent folder
@@ -105,9 +105,7 @@ class OutputFolder:
 
 
 @contextlib.contextmanager
-def output_folder(
-    path: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
-) -> Iterator[OutputFolder]:
+def output_folder(path: PathLike, names: Sequence[str], *, overwrite: bool = False) -> Iterator[OutputFolder]:
     """Reserve a folder for the results `names` of the block; remains of a killed writer are removed.
 
     Raises `DataError` as `check_folder` does, and if another process is writing there.

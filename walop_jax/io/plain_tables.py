@@ -6,7 +6,6 @@ Columns with unit and description, FITS or ECSV.
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ from astropy.table import Column as AstropyColumn
 from astropy.table import Table, vstack
 
 from walop_jax.io.atomic import atomic_path
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 
 FORMATS = {
     ".fits": "fits",
@@ -32,7 +31,7 @@ FORMATS = {
 """Extensions of tables that are read, and what astropy calls the format."""
 
 
-def table_format(path: str | os.PathLike[str]) -> str:
+def table_format(path: PathLike) -> str:
     """Format of a table with this name, as astropy calls it.
 
     Raises `DataError` for an extension that is none of `FORMATS`.
@@ -93,7 +92,7 @@ def stacked(first: Any, second: Any) -> Any:
     return vstack([first, second], metadata_conflicts="silent")
 
 
-def write_table(path: str | os.PathLike[str], table: Table, *, overwrite: bool = False) -> None:
+def write_table(path: PathLike, table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
 
     Raises `DataError` as `atomic_path` does, for an unknown extension, and for columns that the format cannot hold.

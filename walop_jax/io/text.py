@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 
 _MOST_PLACES = 8
 _WRITTEN_OUT = 1e7
@@ -105,7 +105,7 @@ _LARGEST = 1 << 24
 """Bytes of a text file beyond which it is none of ours."""
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
+def read_text(path: PathLike) -> str:
     """The text of a file, without its byte-order mark; `DataError` if it is missing, beyond 16 MiB or not in UTF-8."""
     try:
         if check_input(path).stat().st_size > _LARGEST:
@@ -134,7 +134,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     return content
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
+def read_json(path: PathLike) -> Any:
     """The content of a JSON file that this program has written; `DataError` as for `read_text`, or if it is none."""
     text = read_text(path)
     try:
@@ -198,7 +198,7 @@ _OTHERS = {
 }
 
 
-def check_input(path: str | os.PathLike[str]) -> Path:
+def check_input(path: PathLike) -> Path:
     """Return `path` if it is that of an ordinary file, or of a link to one.
 
     Raises `DataError` if nothing is there, and for folders, named pipes, sockets and devices: opening a pipe waits

@@ -32,11 +32,14 @@ from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_posi
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.light import Counts
 from walop_jax.model.parameters import Vector, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.sources import Sight
 from walop_jax.model.specification import series_indices
 
+Flux = Float[Array, "e f"]
+Nodes = FieldTable | None
 NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
 
 
@@ -80,7 +83,7 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
 
 
 def rows_at(
-    values: Vector, template: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
+    values: Vector, template: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
 ) -> Float[Array, "m b r 4"]:
     """Band rows at the sites of a point, of an instrument with these values of its parameters; with their slopes."""
     sites = field_sites(template, point)
@@ -102,7 +105,7 @@ def unit_counts(
     rows: Float[Array, "m b r 4"],
     throughput: Float[Array, "m k"],
     point: PointData,
-) -> Float[Array, "e k"]:
+) -> Counts:
     """Counts for light of unit flux, ahead of the detectors."""
     x, y = field_sites(instrument, point)
     sight = point.sight(plan)
@@ -114,25 +117,19 @@ def unit_counts(
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
-def point_prediction(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
-) -> Float[Array, "e k"]:
+def point_prediction(instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None) -> Counts:
     """Counts of one point for light of unit flux, ahead of the detectors."""
     rows = rows_at(values_of(instrument), instrument, plan, point, nodes)
     return unit_counts(instrument, plan, rows, throughput_at(instrument, point), point)
 
 
-def vectors_at(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
-) -> Float[Array, "b k 4"]:
+def vectors_at(instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None) -> light.Vectors:
     """Analysis vectors of a point in every band."""
     rows = rows_at(values_of(instrument), instrument, plan, point, nodes)[0]
     return light.camera_vectors(instrument, rows, throughput_at(instrument, point)[0], point.x, point.y)
 
 
-def best_flux(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
-) -> Float[Array, "e f"]:
+def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> Flux:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
     flux_known, shared = plan.exposures.flux_known, sharing(instrument, plan)
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
@@ -145,30 +142,24 @@ def best_flux(
     return flux
 
 
-def real_counts(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
-) -> Float[Array, "e k"]:
+def real_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux) -> Counts:
     """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit)
 
 
-def counts_and_slope(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], flux: Float[Array, "e f"]
-) -> tuple[Float[Array, "e k"], Float[Array, "e k"]]:
+def counts_and_slope(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux) -> tuple[Counts, Counts]:
     """The same, and their derivative with respect to the flux."""
     return jax.jvp(lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),))
 
 
 def point_residuals(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
-) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
+) -> tuple[Flux, Counts]:
     """Best flux of every exposure of one point and the normalised residuals data − model."""
     return residuals_of(instrument, plan, point_prediction(instrument, plan, point, nodes), point)
 
 
-def residuals_of(
-    instrument: Instrument, plan: Plan, unit: Float[Array, "e k"], point: PointData
-) -> tuple[Float[Array, "e f"], Float[Array, "e k"]]:
+def residuals_of(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> tuple[Flux, Counts]:
     """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
     residual = (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
@@ -176,12 +167,12 @@ def residuals_of(
 
 
 def _linear_unit_counts(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes
 ) -> LocalDerivatives:
     """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
     to_instrument = with_values(instrument)
 
-    def counts(values: Vector, local: Float[Array, "m k"]) -> Float[Array, "e k"]:
+    def counts(values: Vector, local: Float[Array, "m k"]) -> Counts:
         rows = rows_at(values, instrument, plan, point, nodes)
         return unit_counts(to_instrument(values), plan, rows, local, point)
 
@@ -194,7 +185,7 @@ def _star_responses(
     """Share by which counts of a star change for 1 rms (`fields`, field by field) of q, then of u."""
     standard = instrument.standard
 
-    def counts(off: Float[Array, "2 f"], point: PointData) -> Float[Array, "e k"]:
+    def counts(off: Float[Array, "2 f"], point: PointData) -> Counts:
         moved = instrument.changed("standard", q=standard.q + off[0] @ fields, u=standard.u + off[1] @ fields)
         return point_prediction(moved, plan, point)
 
@@ -206,9 +197,7 @@ def _star_responses(
     return jax.vmap(at)(data)
 
 
-def unit_slopes(
-    instrument: Instrument, plan: Plan, point: PointData
-) -> tuple[Float[Array, "e k"], Float[Array, "e k n"]]:
+def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> tuple[Counts, Float[Array, "e k n"]]:
     """Counts of one point for light of unit flux, and their derivatives with respect to all parameters."""
     unit, plain, local = _linear_unit_counts(instrument, plan, point, None)
     basis = instrument.throughput.basis(*field_sites(instrument, point))
@@ -216,7 +205,7 @@ def unit_slopes(
 
 
 def _point_jacobian(
-    instrument: Instrument, plan: Plan, point: PointData, nodes: FieldTable | None = None
+    instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
 ) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
     """Residuals of one point and their derivatives with respect to its local quantities.
 
@@ -245,9 +234,7 @@ def _point_jacobian(
     return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
-def normal_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
-) -> Normal:
+def normal_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None) -> Normal:
     """χ² and its expansion from some points: with optics on nodes block by block, else from the rows of all points.
 
     Rows come from a program that errors and verdict need anyway, `limits.BATCH` points at a time.
@@ -313,7 +300,7 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
 
 
 def _residuals(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable | None = None
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None
 ) -> tuple[Float[Array, "p e f"], Float[Array, "p e k"]]:
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
@@ -329,12 +316,12 @@ def _linearised_residuals(
     return residual, spread(local, basis)
 
 
-def _incoming(instrument: Instrument, plan: Plan, data: PointData) -> Float[Array, "p e 4"]:
-    """Stokes vectors that enter the collimator."""
-    return jax.vmap(lambda point: light.stokes(instrument, point.sight(plan)))(data)
+def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
+    return light.stokes(instrument, point.sight(plan))
 
 
-incoming = compiled(_incoming, kept_as="incoming")
+incoming = compiled(jax.vmap(_incoming, (None, None, 0)), kept_as="incoming")
+"""Stokes vectors that enter the collimator."""
 _table_equations = compiled(_on_table, kept_as="table_equations")
 linearised_residuals = compiled(
     _linearised_residuals, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"

@@ -30,11 +30,9 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.model import light
 from walop_jax.model.dependence import optical_reach
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import values_of, with_values
+from walop_jax.model.parameters import Scalar, Vector, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import series_indices
-
-Scalar = Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,8 +76,8 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
 
 
 def _slopes(
-    values: Float[Array, " n"], instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> tuple[Directions, Float[Array, "b r 4"], Float[Array, "c b r 4"]]:
+    values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> tuple[Directions, light.Rows, Float[Array, "c b r 4"]]:
     """Band rows and their derivatives along `directions`."""
     along = directions(instrument, plan)
     rows, push = jax.linearize(lambda v: light.band_rows(with_values(instrument)(v), plan, x, y), values)
@@ -87,9 +85,7 @@ def _slopes(
 
 
 @jax.custom_jvp
-def band_rows(
-    values: Float[Array, " n"], instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> Float[Array, "b r 4"]:
+def band_rows(values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> light.Rows:
     """Band rows (`light.band_rows`) at a field position (deg), of an instrument with these values of its parameters."""
     return light.band_rows(with_values(instrument)(values), plan, x, y)
 
@@ -121,7 +117,7 @@ band_rows.defjvp(_rule, symbolic_zeros=True)
 
 def rows_and_slopes(
     instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> tuple[Float[Array, "b r 4"], Float[Array, "o b r 4"]]:
+) -> tuple[light.Rows, Float[Array, "o b r 4"]]:
     """Band rows at a field position (deg) and their exact derivatives in the parameters of `directions`."""
     along, rows, slopes = _slopes(values_of(instrument), instrument, plan, x, y)
     return rows, slopes[along.colour] * along.reached[:, None, :, None]
@@ -129,7 +125,7 @@ def rows_and_slopes(
 
 @jax.custom_jvp
 def with_slopes(
-    values: Float[Array, " n"],
+    values: Vector,
     rows: Float[Array, "*m b r 4"],
     slopes: Float[Array, "o *m b r 4"],
     index: Int[Array, " o"],

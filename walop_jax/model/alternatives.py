@@ -95,14 +95,12 @@ def _turned_plates(instrument: Instrument) -> Iterator[Named]:
 
 def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
     for turn in TURNS:
-
-        def azimuth(old: Any, turn: float = turn) -> Any:
-            return jnp.asarray(turn) if old is None else old + turn
-
         yield from _each_and_all(
             [*_used(instrument, Wedge)],
             f"turned by {turn:.0f} deg",
-            lambda i, place, azimuth=azimuth: i.changed(place, azimuth=azimuth),
+            lambda i, place, turn=turn: i.changed(
+                place, azimuth=lambda old: jnp.asarray(turn) if old is None else old + turn
+            ),
         )
 
 

@@ -157,12 +157,10 @@ def _found(name: str) -> Any:
 
 
 def _made(plain: Any) -> Any:
-    """Inverse of `_plain`; sets become frozen sets, mappings dicts."""
+    """Inverse of `_plain` for results of programs: numbers in dicts, tuples, named tuples, lists and objects."""
     if not isinstance(plain, list):
         return plain
     kind, *entries = plain
-    if kind == "array":
-        return np.frombuffer(bytes.fromhex(entries[2]), entries[0]).reshape(entries[1])
     if kind == "dict":
         return {_made(key): _made(entry) for key, entry in entries}
     if kind == "object":
@@ -170,9 +168,9 @@ def _made(plain: Any) -> Any:
         for name, value in entries[1].items():
             object.__setattr__(instance, name, _made(value))
         return instance
-    if kind in ("name", "named"):
-        return _found(entries[0]) if kind == "name" else _found(entries[0])._make(map(_made, entries[1:]))
-    return {"tuple": tuple, "list": list, "frozenset": frozenset}[kind](map(_made, entries))
+    if kind == "named":
+        return _found(entries[0])._make(map(_made, entries[1:]))
+    return {"tuple": tuple, "list": list}[kind](map(_made, entries))
 
 
 @functools.cache

@@ -185,8 +185,13 @@ class Fold(NamedTuple):
             path = [*stack[:count], *stack[first : first + len(arm)]]
             last = blank.at[:, :, row : row + len(analysed)].set(analysed)
             row, first = row + len(analysed), first + len(arm)
-            rows = [*itertools.accumulate(reversed(path), _ahead, initial=last)][::-1]
-            places = [*zip(rows, itertools.accumulate(path, _behind, initial=start), strict=True)]
+            ahead = itertools.accumulate(
+                path, lambda matrix, m: matrix if m is None else m @ matrix, initial=start
+            )
+            rows = itertools.accumulate(
+                reversed(path), lambda rows, m: rows if m is None else rows @ m, initial=last
+            )
+            places = [*zip([*rows][::-1], ahead, strict=True)]
             arm_places.append((places[: count + 1], places[count:]))
         # Of the common train, as each of the arms sees it.
         same = zip(*(shared for shared, _ in arm_places), strict=True)
@@ -239,11 +244,3 @@ def _restricted(state: State, columns: set[int]) -> State:
 
 def _ordered(rows: Float[Array, "c n r 4"], order: list[int]) -> Float[Array, "d n r 4"]:
     return rows if order == list(range(len(rows))) else rows[np.array(order)]
-
-
-def _behind(matrix: Array, step: Mueller | None) -> Array:
-    return matrix if step is None else step @ matrix
-
-
-def _ahead(rows: Array, step: Mueller | None) -> Array:
-    return rows if step is None else rows @ step

@@ -117,7 +117,9 @@ def _unit(entry: Mapping[str, Any]) -> str:
 
 def _element(kind: type[Element]) -> Iterator[str]:
     """The paragraphs of the page of a kind of elements."""
-    head = _head_text(kind)
+    head = inspect.cleandoc(kind.__doc__ or "")
+    if "\nEquation " not in head:  # it is in the head of the file
+        head = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
     yield from (f"# {kind.kind}", f"{_about(kind)}.", *_indented(head.partition("\n")[2].strip("\n")))
     yield from _table(
         ("number", "unit", "meaning"), [(n, d.unit, d.about) for n, d in numbers_of(kind).items()]
@@ -127,12 +129,6 @@ def _element(kind: type[Element]) -> Iterator[str]:
         yield f"Effects that name it: {', '.join(f'`{name}`' for name in changed)}."
     if kind.reference and "\nSource" not in head:
         yield f"Source: {kind.reference}."
-
-
-def _head_text(kind: type[Any]) -> str:
-    """The text with its equation: of the class, or of the head of its file."""
-    text = inspect.cleandoc(kind.__doc__ or "")
-    return text if "\nEquation " in text else inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "")
 
 
 def _indented(head: str) -> Iterator[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -24,6 +23,7 @@ from walop_jax.instruments.description import (
     read_description,
     shipped,
 )
+from walop_jax.io.errors import PathLike
 from walop_jax.model import fold, legendre
 from walop_jax.model.build import parts, with_origins
 from walop_jax.model.compiled import array, need_float64
@@ -73,7 +73,7 @@ class Instrument(LightPath):
         )
 
     @classmethod
-    def read(cls, source: str | os.PathLike[str], **options: Any) -> Instrument:
+    def read(cls, source: PathLike, **options: Any) -> Instrument:
         """The instrument of a description file, or a shipped one by name; options as for `build`.
 
         Raises `DataError`, with file, table and key, for an invalid file.

@@ -123,7 +123,13 @@ def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Rows:
     wavelength = node_wavelengths(instrument, plan)
 
     def at(wavelength: Float[Array, " n"]) -> Float[Array, "c n r 4"]:
-        return _node_rows(instrument, plan, Ray.entering(x, y, (wavelength, plan.conditions)))
+        """Rows of the analysers at every node, in every state."""
+        ray = Ray.entering(x, y, (wavelength, plan.conditions))
+        leading, banded = divided(instrument)
+        for element in leading:
+            ray = element.ray(ray)
+        path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.states)
+        return path.backward(path.solved(), len(plan.wavelength))
 
     rows = with_dispersion(instrument, at, wavelength)
     weights = band_weights(instrument, plan)
@@ -168,15 +174,6 @@ def with_dispersion(instrument: LightPath, rows: Callable[[Array], Any], wavelen
 def is_dispersed(instrument: LightPath) -> bool:
     """True if the beams of an analyser differ in wavelength."""
     return any(arm.analyser.dispersion is not None for arm in instrument.arms)
-
-
-def _node_rows(instrument: LightPath, plan: Plan, ray: Ray) -> Float[Array, "c n r 4"]:
-    """Rows of the analysers at every node, in every state."""
-    leading, banded = divided(instrument)
-    for element in leading:
-        ray = element.ray(ray)
-    path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.states)
-    return path.backward(path.solved(), len(plan.wavelength))
 
 
 def camera_vectors(instrument: LightPath, rows: Rows, throughput: Shares, x: Scalar, y: Scalar) -> Vectors:

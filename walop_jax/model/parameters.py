@@ -254,12 +254,12 @@ def by_shapes(function: Callable[..., Result]) -> Callable[..., Result]:
 def parameter_places(component: Component) -> tuple[tuple[int, int], ...]:
     """For every parameter array its position among the leaves of the flattened tree, and its size."""
     flat, _ = jax.tree_util.tree_flatten_with_path(component)
-    position = {tuple(_key(entry) for entry in path): i for i, (path, _) in enumerate(flat)}
+
+    def key(entry: Any) -> str:
+        return str(next(getattr(entry, of) for of in ("name", "idx", "key") if hasattr(entry, of)))
+
+    position = {tuple(map(key, path)): i for i, (path, _) in enumerate(flat)}
     return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
-
-
-def _key(entry: Any) -> str:
-    return str(next(getattr(entry, of) for of in ("name", "idx", "key") if hasattr(entry, of)))
 
 
 def values_of(component: Component) -> Vector:

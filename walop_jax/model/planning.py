@@ -86,7 +86,10 @@ def plan_for(
         colour = np.tile(sources.teff, of_stars.sum())
         teff[starlight] = np.where(np.isfinite(colour), colour, teff[starlight])
     sloping = np.flatnonzero(of_stars) if instrument.standard.bands else indices[:0]
-    row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), _typical(sources)))
+    # For slopes, of second order, a typical star will do.
+    temperatures = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
+    typical = float(np.median(temperatures)) if temperatures.size else np.nan
+    row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), typical))
     settings = dataclasses.replace(exposure_settings[row], teff=teff)
 
     def band_of(band: Int[np.ndarray, " n"]) -> Int[np.ndarray, "e s"]:
@@ -116,12 +119,6 @@ def plan_for(
         plan.exposures, colour=array(colours(exposures, curves, sources)), slope_band=array(slope_band, int)
     )
     return dataclasses.replace(plan, exposures=coloured)
-
-
-def _typical(sources: Sources | None) -> float:
-    """Colour temperature of a typical star, for slopes of second order."""
-    temperatures = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
-    return float(np.median(temperatures)) if temperatures.size else np.nan
 
 
 def colours(

@@ -295,17 +295,13 @@ def _inserted(
     behind, ahead = (jnp.stack([sides[place][side] for place in sorted(sides)]) for side in (0, 1))
     pairs = jnp.einsum("hcnri,hcnjk->hijcnrk", behind, ahead)
     products = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
-    return jnp.einsum("gij,mhijbrk->mghbrk", _generators(), products)
-
-
-def _generators() -> Float[Array, "g 4 4"]:
-    """Slopes of the Mueller matrix in each of `GENERATORS`, at neutral."""
     changes, zero = [Change(kind, "of", "") for kind in GENERATORS], jnp.zeros(())
 
     def matrix(sizes: Float[Array, " g"]) -> Float[Array, "4 4"]:
         return matrix_of(list(zip(changes, sizes, strict=True)), zero, zero)
 
-    return jnp.moveaxis(jax.jacfwd(matrix)(jnp.zeros(len(changes))), -1, 0)
+    generators = jax.jacfwd(matrix)(jnp.zeros(len(changes)))
+    return jnp.einsum("ijg,mhijbrk->mghbrk", generators, products)
 
 
 # ----------------------------------------------------------------------------------------------------- light

@@ -65,17 +65,20 @@ class Model(Displayed):
 
     def to_table(self) -> Any:
         """All parameters as an astropy table: start value, unit, prior, state and meaning."""
+        return astropy_table(self.columns())
+
+    def columns(self) -> dict[str, tuple[np.ndarray, str, str]]:
+        """Columns of `to_table`: values, unit and meaning."""
         priors = np.array([p.prior or (np.nan, np.nan) for p in self.parameters]).reshape(-1, 2)
-        columns: Mapping[str, tuple[np.ndarray, str, str]] = {
+        return {
             "NAME": (np.array(self.names), "", "parameter"),
-            "START": (self.start, "", "start value"),
             "UNIT": (np.array([p.unit for p in self.parameters]), "", "unit of the numbers of this row"),
+            "START": (self.start, "", "start value"),
             "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
             "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
             "STATE": (np.array([p.state or "free" for p in self.parameters]), "", "free, fixed or tied"),
             "ABOUT": (np.array([p.about for p in self.parameters]), "", "meaning"),
         }
-        return astropy_table(columns)
 
     def __post_init__(self) -> None:
         names = self.names

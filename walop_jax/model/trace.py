@@ -19,9 +19,7 @@ from jaxtyping import Array, Float
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.model import fold, light
-from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import Sight, Standards
@@ -96,7 +94,11 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     for (element, _), matrix in zip(path.common, ahead, strict=True):
         nodes = _through(matrix, nodes)
         if matrix is not None or element.moves:
-            stages.append(_one(element.name, _about(element, plan), weight @ nodes))
+            about = element.__doc__ or ""
+            if element.moves is not None:
+                (angle,) = fold.positions(element, plan.moving, plan.states[:1])
+                about = "out of the beam" if angle is None else f"at {angle:g}°"
+            stages.append(_one(element.name, about, weight @ nodes))
     of_arms = [
         weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)
         for arm in inside
@@ -120,14 +122,6 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
 
 def _through(matrix: Float[Array, "... 4 4"] | None, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
     return nodes if matrix is None else jnp.einsum("...st,...t->...s", matrix, nodes)
-
-
-def _about(element: Element, plan: Plan) -> str:
-    """Remark on an element: its description, or its position."""
-    if element.moves is None:
-        return type(element).__doc__ or ""
-    (angle,) = fold.positions(element, plan.moving, plan.states[:1])
-    return "out of the beam" if angle is None else f"at {angle:g}°"
 
 
 def _one(name: str, about: str, beam: Float[Array, " 4"]) -> LightStage:

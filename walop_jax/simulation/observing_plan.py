@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import tomlkit
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from walop_jax.data.checks import checked_curve
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
@@ -24,7 +24,7 @@ from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Sit
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import default_name, described, shipped
-from walop_jax.io.errors import errors_naming, nearest
+from walop_jax.io.errors import PathLike, errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import OUT, Reader
 from walop_jax.model.effects.base import Context
@@ -320,16 +320,12 @@ class ObservingPlan:
         """The filters with their curves. Raises ValueError for a name that is not known and a curve that is none."""
         return {_name_of(entry): filter_curve(entry) for entry in self.filters}
 
-    @property
-    def _angles(self) -> tuple[float, ...]:
-        """Those of the polariser; none where the light path has no polariser."""
-        return () if self.design.polariser is None else self.polariser_angles
-
     @functools.cached_property
     def _taken(self) -> tuple[Stop, ...]:
         """Every exposure, in the order in which they are taken."""
         further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
-        angles = (*self._angles, *(None for _ in range(self.lamps)))
+        of_polariser = () if self.design.polariser is None else self.polariser_angles
+        angles = (*of_polariser, *[None] * self.lamps)
         indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
             for f in self.filter_names
@@ -368,7 +364,11 @@ class ObservingPlan:
         mjd = self.start + self.spacing / _MINUTES_A_DAY * (np.arange(n) - (sky.min() if len(sky) else n))
         ra, dec, rotator = np.full((3, n), NAN)
         if len(moon):
-            ra[moon], dec[moon] = self._patches(mjd[moon], number[moon])
+            # Around the Moon: separations and position angles spread evenly.
+            (near, far), turns = self.separations, number[moon] * _GOLDEN
+            away = near + (far - near) * np.mod(0.5 + turns, 1.0)
+            direction = body_direction("moon", mjd[moon], self.site)
+            ra[moon], dec[moon] = offset_direction(*direction, 360.0 * _GOLDEN * number[moon], away)
         rotator[moon] = np.array(_MOON_ROTATOR)[number[moon] % 4]
         rotator[star] = np.array(_STAR_ROTATOR)[number[star] % 4]
         # Pointings that the plan does not fix are spread over ±3 h, out of step with the polariser.
@@ -398,14 +398,6 @@ class ObservingPlan:
                 **{prefix: Position.at(stop.moving.get(prefix) for stop in stops) for prefix in self.moving},
             },
         )
-
-    def _patches(
-        self, mjd: Float[np.ndarray, " m"], order: Int[np.ndarray, " m"]
-    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Field centres (deg) around the Moon: separations and position angles spread evenly."""
-        near, far = self.separations
-        separation = near + (far - near) * np.mod(0.5 + order * _GOLDEN, 1.0)
-        return offset_direction(*body_direction("moon", mjd, self.site), 360.0 * _GOLDEN * order, separation)
 
     def layout(self) -> tuple[Bool[np.ndarray, "p e"], np.ndarray]:
         """True for the (point, exposure) pairs that are measured, and the row of the star in each (−1: none)."""
@@ -489,14 +481,12 @@ _ANGLES = len(polariser_turn())
 FULL_TURN = "full_turn"
 
 
-def is_plan(path: str | os.PathLike[str]) -> bool:
+def is_plan(path: PathLike) -> bool:
     """True for a file that is a plan by its name."""
     return Path(path).suffix.lower() == ".toml"
 
 
-def read_plan(
-    path: str | os.PathLike[str], instrument: str | os.PathLike[str] | None = None
-) -> ObservingPlan:
+def read_plan(path: PathLike, instrument: PathLike | None = None) -> ObservingPlan:
     """The plan of a file; `instrument`, a name or a description file, goes before its own.
 
     Raises `DataError` for a file that cannot be read, for names and values that a plan does not have.
@@ -506,7 +496,7 @@ def read_plan(
 
 
 def plan_of(
-    content: dict[str, Any], folder: Path, instrument: str | os.PathLike[str] | Instrument | None = None
+    content: dict[str, Any], folder: Path, instrument: PathLike | Instrument | None = None
 ) -> ObservingPlan:
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)

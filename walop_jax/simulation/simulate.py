@@ -241,7 +241,11 @@ def simulate(
         # A generator for each point: a last digit that another machine computes differently stays where it is.
         drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
         counts, sigma = (np.stack(arrays) for arrays in zip(*drawn, strict=True))
-        counts += _beyond_photons(detector.sigma(expected), expected, truth.cameras.floor, noise)
+        if floor := truth.cameras.floor:
+            # Noise up to the errors that fits take the cameras to have; N_ERR has it not.
+            stated = detector.sigma(expected)
+            beyond = np.sqrt(with_floor(stated, expected, floor) ** 2 - stated**2)
+            counts += beyond * noise.standard_normal(expected.shape)
     table = TableIntensities.of(blank.intensities, blank.points)
     at = table.point, table.exposure
     measured = dataclasses.replace(table, counts=counts[at], sigma=sigma[at])
@@ -272,14 +276,6 @@ def true_instrument(
     return sources, jax.tree.map(
         array, dataclasses.replace(instrument.with_source(standards), effects=active)
     )
-
-
-def _beyond_photons(sigma: Cube, expected: Cube, floor: float, rng: np.random.Generator) -> Cube | float:
-    """Noise that brings an error up to the `floor` of the cameras, which fits take it to have and N_ERR does not."""
-    if floor == 0.0:
-        return 0.0
-    total = with_floor(sigma, expected, floor)
-    return np.sqrt(total**2 - sigma**2) * rng.standard_normal(expected.shape)
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from walop_jax.data.records import Sources
 from walop_jax.instruments.description import parsed
-from walop_jax.io.errors import errors_naming, fail
+from walop_jax.io.errors import PathLike, errors_naming, fail
 from walop_jax.io.text import read_text
 from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name
-from walop_jax.model.effects.base import Context, Effect
+from walop_jax.model.effects.base import Effect
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build
 from walop_jax.model.parameters import leaves, with_values
@@ -90,7 +89,7 @@ def truth_document(plan: ObservingPlan, seed: int, sources: Sources, truth: Inst
     }
 
 
-def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFFECTS) -> Template:
+def read_truth(path: PathLike, effects: Sequence[EffectKind] = EFFECTS) -> Template:
     """The template that a file of `truth_document` describes; `DataError` for any other file."""
     text = read_text(path)
     try:
@@ -103,7 +102,11 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
         )
         raise fail("is not the truth of a simulated set", file=path, advice=advice) from None
     with errors_naming(path):
-        design = _design(content)
+        if description := content.get("description"):
+            where = f"the description of {content['instrument']}"
+            design = build(parsed(description, where), elements=defined_elements())
+        else:
+            design = Instrument.read(content["instrument"])
         observing_plan = plan_of_document(plan, design)
         sources = Sources(**{name: np.asarray(catalogue[name]) for name in _CATALOGUE})
         standards = standards_of(sources, observing_plan.exposures(), observing_plan.curves())
@@ -111,8 +114,11 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
             design, throughput_degree=observing_plan.throughput_degree, throughput=LEVEL
         ).with_source(standards)
         context = observing_plan.context()._replace(sources=standards.star_names)
-        active = tuple(_effect(name, choices, context, effects) for name, choices in names.items())
-        template = dataclasses.replace(bare, effects=active)
+        active = []  # with their discrete choices; numbers are put in later
+        for name, choices in names.items():
+            stated = {k: tuple(value) if isinstance(value, list) else value for k, value in choices.items()}
+            active.append(effect_by_name(name, tuple(effects)).of(context, **stated))
+        template = dataclasses.replace(bare, effects=tuple(active))
         order = [leaf.name for leaf in leaves(template)]
         if set(order) != set(values):
             raise ValueError(
@@ -120,18 +126,3 @@ def read_truth(path: str | os.PathLike[str], effects: Sequence[EffectKind] = EFF
             )
         numbers = np.array([values[name]["value"] for name in order], float)
         return Template(with_values(template)(numbers), sources, observing_plan)
-
-
-def _design(content: Mapping[str, Any]) -> Instrument:
-    """The instrument as designed: that of the description in the file, or one that comes with the package."""
-    if text := content.get("description"):
-        return build(parsed(text, f"the description of {content['instrument']}"), elements=defined_elements())
-    return Instrument.read(content["instrument"])
-
-
-def _effect(name: str, choices: Mapping[str, Any], context: Context, known: Sequence[EffectKind]) -> Effect:
-    """An effect with its discrete choices; its numbers are put in later."""
-    choices_given = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in choices.items()
-    }
-    return effect_by_name(name, tuple(known)).of(context, **choices_given)

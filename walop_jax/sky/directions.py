@@ -169,17 +169,14 @@ def registered(
         _, rows, matches = mutual(registration.apply(bright), bright_reference, radius)
         if len(rows) < FEWEST_REGISTERED:
             break
-        registration = _fitted(bright[rows], bright_reference[matches])
+        # By least squares, small rotations: place = reference + shift + angle × (−Y, X).
+        x, y = bright_reference[matches].T
+        ones, zeros = np.ones(len(x)), np.zeros(len(x))
+        design = np.concatenate([np.stack([ones, zeros, -y], 1), np.stack([zeros, ones, x], 1)])
+        off = (bright[rows] - bright_reference[matches]).T.ravel()
+        *shift, angle = np.linalg.lstsq(design, off, rcond=None)[0]
+        registration = Registration(3600.0 * np.array(shift), float(np.rad2deg(angle)), len(x))
     return registration
-
-
-def _fitted(place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]) -> Registration:
-    """Shift and rotation by least squares, small rotations: place = reference + shift + angle × (−Y, X)."""
-    x, y = reference.T
-    ones, zeros = np.ones(len(x)), np.zeros(len(x))
-    design = np.concatenate([np.stack([ones, zeros, -y], 1), np.stack([zeros, ones, x], 1)])
-    along_x, along_y, angle = np.linalg.lstsq(design, (place - reference).T.ravel(), rcond=None)[0]
-    return Registration(3600.0 * np.array([along_x, along_y]), float(np.rad2deg(angle)), len(x))
 
 
 def mutual(

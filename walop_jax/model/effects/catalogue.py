@@ -40,7 +40,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from walop_jax.io.code import classes_of
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.effects.change import Change
@@ -71,14 +71,14 @@ def entries(content: Mapping[str, Any]) -> tuple[EffectKind, ...]:
         if not isinstance(table, Mapping):
             raise ValueError(f"{name} = {table!r} must be a table, [{name}]")
         try:
-            result.append(_class_of(name, table) if "class" in table else _entry(name, table))
+            if "class" in table:
+                module = importlib.import_module(f"walop_jax.model.effects.{name}")
+                result.append(getattr(module, table["class"]))
+            else:
+                result.append(_entry(name, table))
         except (TypeError, ValueError) as error:
             raise ValueError(f"[{name}] {error}") from None
     return tuple(result)
-
-
-def _class_of(name: str, table: Mapping[str, Any]) -> EffectKind:
-    return getattr(importlib.import_module(f"walop_jax.model.effects.{name}"), table["class"])
 
 
 def _entry(name: str, table: Mapping[str, Any]) -> Entry:
@@ -157,7 +157,7 @@ def _texts(value: Any) -> tuple[str, ...]:
     return (value,) if isinstance(value, str) else tuple(value)
 
 
-def own_entries(path: str | os.PathLike[str]) -> tuple[EffectKind, ...]:
+def own_entries(path: PathLike) -> tuple[EffectKind, ...]:
     """The effects of a user's TOML file. Raises `DataError`, with file, entry and key, for invalid entries."""
     text = read_text(path)
     try:
@@ -186,7 +186,7 @@ def is_own(effect: Effect) -> TypeGuard[Named]:
     return isinstance(effect, Named) and effect.kind not in EFFECTS
 
 
-def catalogue_with(own: str | os.PathLike[str] | None) -> tuple[EffectKind, ...]:
+def catalogue_with(own: PathLike | None) -> tuple[EffectKind, ...]:
     """The catalogue followed by the effects of a file (None: nothing more): entries of a TOML file, classes of Python.
 
     A Python file is run. Raises `DataError` if that fails, and for a file without effects, or with an effect without a

@@ -234,16 +234,11 @@ def _with_sky_film(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     return instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(terms))))
 
 
-def _differs(instrument: Instrument, terms: Sequence[Term]) -> bool:
-    """True for changes ahead of the polariser that vary from exposure to exposure."""
-    with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
-    return with_exposure and _is_ahead(instrument, terms[0][0])
-
-
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; in the beam together with a moving element or polariser of that place."""
     change, polariser = terms[0][0], instrument.polariser
-    if _differs(instrument, terms):
+    with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
+    if with_exposure and _is_ahead(instrument, change):
         return _with_sky_film(instrument, terms)
     if change.where == "of" and polariser is not None and change.place == polariser.name:
         return instrument.changed(change.place, films=lambda films: (*films, Film(**_columns(terms))))

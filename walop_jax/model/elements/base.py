@@ -51,7 +51,11 @@ class Element(Component):
         One element at many angles is traced once: an instrument with many settings would take minutes otherwise.
         """
         result: list[Mueller | None] = [None] * len(cases)
-        for members in _turned_copies(cases):
+        copies: dict[tuple[int, ...], list[int]] = {}  # of one element at different angles in the same ray
+        for i, (element, ray) in enumerate(cases):
+            values = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
+            copies.setdefault((*map(id, values), id(ray)), []).append(i)
+        for members in copies.values():
             element, ray = cases[members[0]]
             if len(members) == 1:
                 result[members[0]] = element.mueller(ray)
@@ -90,12 +94,3 @@ class Element(Component):
         hundreds of times more weakly.
         """
         return ()
-
-
-def _turned_copies(cases: Sequence[tuple[Any, Ray]]) -> list[list[int]]:
-    """Positions of the cases of one element at different angles in the same ray, in groups."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for i, (element, ray) in enumerate(cases):
-        values = [getattr(element, f.name) for f in dataclasses.fields(element) if f.name != "axis"]
-        groups.setdefault((*map(id, values), id(ray)), []).append(i)
-    return list(groups.values())

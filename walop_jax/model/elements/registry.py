@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 
 from walop_jax.io.code import classes_of
-from walop_jax.io.errors import fail
+from walop_jax.io.errors import PathLike, fail
 from walop_jax.model.elements import geometry, simple, spectral, wave_plate
 from walop_jax.model.elements.base import Element
 
@@ -29,7 +29,7 @@ def defined_elements() -> tuple[type[Element], ...]:
     return tuple(kinds.values())
 
 
-def load_elements(given: str | os.PathLike[str] | Sequence[type]) -> None:
+def load_elements(given: PathLike | Sequence[type]) -> None:
     """Run a user's file of kinds of elements, which registers them (`defined_elements`).
 
     Raises `DataError` for a file without such a class, TypeError for another class.

@@ -172,20 +172,15 @@ class FieldDiattenuator(Element):
         if self.none_at > 0.0:
             gap = sum(knot < self.none_at for knot in knots)
             knots = (*knots[:gap], self.none_at, *knots[gap:])
-        contributions = [
-            terms[..., n] * spline(knots, _with_zero(values, gap, len(knots)), ray.wavelength)
-            for name, n in FIELD_TERMS.items()
-            if (values := getattr(self, name)) is not None
-        ]
+        contributions, none = [], jnp.zeros(len(knots) - len(self.at))
+        for name, n in FIELD_TERMS.items():
+            if (values := getattr(self, name)) is not None:
+                values = jnp.concatenate([values[:gap], none, values[gap:]])
+                contributions.append(terms[..., n] * spline(knots, values, ray.wavelength))
         if not contributions:
             return None
         d, twice = sum(contributions[1:], contributions[0]), 2.0 * jnp.deg2rad(self.axis)
         return mueller.diattenuator(d * jnp.cos(twice), d * jnp.sin(twice))
-
-
-def _with_zero(values: Curve, at: int, count: int) -> Float[Array, " n"]:
-    """Values of a curve, with a zero inserted into a curve of one value less than `count`."""
-    return values if len(values) == count else jnp.concatenate([values[:at], jnp.zeros(1), values[at:]])
 
 
 class Mirror(WithCurves):

@@ -208,7 +208,11 @@ class WavePlate(Element):
             chosen = [cases[i] for i in members]
             for i, matrix in zip(members, _solved_together(chosen, model), strict=True):
                 plate, ray = cases[i]
-                result[i] = _behind_gap(plate, ray, matrix)
+                for gap in plate.air_gaps:  # behind the layers
+                    axis = jnp.deg2rad(_number(plate, "axis", ray) + _number(plate.layers[0], "axis", ray))
+                    d = gap.contrast * fringe(gap.gap, ray)
+                    matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
+                result[i] = matrix
         return result
 
 
@@ -247,11 +251,3 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
 def fringe(gap: Real, ray: Ray) -> Real:
     """Fringes of air of some thickness (µm), 1 at a maximum."""
     return jnp.cos(4.0 * jnp.pi * gap * ray.kz / ray.wavelength)
-
-
-def _behind_gap(plate: WavePlate, ray: Ray, matrix: Mueller) -> Mueller:
-    for gap in plate.air_gaps:
-        axis = jnp.deg2rad(_number(plate, "axis", ray) + _number(plate.layers[0], "axis", ray))
-        d = gap.contrast * fringe(gap.gap, ray)
-        matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))
-    return matrix
