@@ -48,13 +48,6 @@ def test_what_is_no_run_is_refused_with_advice(call, tmp_path, name):
     assert "give the RUN of walop-jax refit or diagnose" in one_line(call("report", tmp_path / name))
 
 
-def test_a_real_run_has_a_page(call, run, tmp_path):
-    assert call("report", run, "-o", tmp_path / "page.html").exit_code == 0
-    text = (tmp_path / "page.html").read_text()
-    assert "half2.plate.mgf2" in text
-    assert "Fit of WALOP-SOUTH: trusted" in text
-
-
 @pytest.mark.long
 def test_a_real_diagnosis_has_its_pictures_and_its_page(call, spoilt_file, tmp_path):
     folder = tmp_path / "run"
