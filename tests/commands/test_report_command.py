@@ -6,13 +6,7 @@ import json
 
 import handmade_run
 import pytest
-
-
-def one_line(result) -> str:
-    assert result.exit_code == 1, result.output
-    errors = [line for line in result.stderr.splitlines() if line.startswith("walop-jax: error: ")]
-    assert len(errors) == 1, result.stderr
-    return errors[0]
+from command import one_line
 
 
 def test_page_appears_in_the_run_and_replaces_nothing_but_itself(call, tmp_path):
