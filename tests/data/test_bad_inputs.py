@@ -122,7 +122,12 @@ BAD = {
     "TEMP kelvin": (put(E, "TEMP", 2, 283.0), "[EXPOSURES] TEMP", "row 2", "kelvin?"),
     "DEC range": (put(E, "DEC", 6, 95.0), "[EXPOSURES] DEC: exceeds ±90 in row 6"),
     # points
-    "pixels": (put(P, "Y", 1, 2048.0), "[POINTS] Y", "row 1 (counted from 0)", "arcmin or pixels?"),
+    "pixels": (
+        put(P, "Y", slice(1, 3), [2e3, -99.0]),
+        "[POINTS] Y",
+        "rows 1, 2 (counted",
+        "arcmin or pixels?",
+    ),
     "point NaN": (put(P, "Y", 1, NAN), "[POINTS] Y: is not finite in row 1"),
     "same point": (put(P, "POINT", 1, 5), "[POINTS] POINT", "rows 0, 1"),
     # intensities
