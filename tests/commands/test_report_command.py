@@ -40,14 +40,3 @@ def test_what_is_no_run_is_refused_with_advice(call, tmp_path, name):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
     assert "give the RUN of walop-jax refit or diagnose" in one_line(call("report", tmp_path / name))
-
-
-@pytest.mark.long
-def test_a_real_diagnosis_has_its_pictures_and_its_page(call, spoilt_file, tmp_path):
-    folder = tmp_path / "run"
-    assert call("diagnose", spoilt_file, "-o", folder, "--quiet").exit_code == 0
-    assert sorted(entry.name for entry in folder.iterdir()) == [
-        "calibration.fits", "diagnosis.fits", "diagnosis.json", "model.toml", "summary.json",
-    ]  # fmt: skip
-    assert json.loads(call("report", folder, "--json").stdout)["missing"] == []
-    assert "clp_wobble: χ²" in (folder / "report.html").read_text()
