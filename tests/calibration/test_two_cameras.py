@@ -343,10 +343,7 @@ def test_what_exposures_hold_of_q_and_u():
 def test_a_table_must_say_where_an_element_stands_that_was_never_out(calibration, tmp_path):
     table, _ = star_rows(np.random.default_rng(4), 2)
     del table["HWP_ANGLE"]
-    with pytest.raises(
-        DataError,
-        match=r"HWP_ANGLE: the angle of HWP is missing.*--at HWP=0",
-    ):
+    with pytest.raises(DataError, match=r"HWP_ANGLE: the angle of HWP is missing.*--at HWP=0"):
         read(table, calibration, tmp_path)
 
 

@@ -11,13 +11,7 @@ import walop_jax as walop
 
 def test_the_table_has_a_line_for_every_stage(call):
     lines = call("trace", "--angle", 30, "--at", "CHWP=45").stdout.splitlines()
-    starts = [
-        "source",
-        "collimator",
-        "chwp",
-        "arms half1",
-        "arms half2",
-    ]
+    starts = ["source", "collimator", "chwp", "arms half1", "arms half2"]
     starts += ["analysers", "cameras", "counts"]
     assert [line for line in lines if not line.startswith(" ")].__len__() == len(starts)
     for start in starts:

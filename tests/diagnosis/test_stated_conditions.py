@@ -26,11 +26,7 @@ from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import with_places
 from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
-from walop_jax.diagnosis.stated_conditions import (
-    Singles,
-    condition_scores,
-    stated_conditions,
-)
+from walop_jax.diagnosis.stated_conditions import Singles, condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
@@ -89,10 +85,7 @@ def not_linear(calset: CalibrationSet) -> CalibrationSet:
 
 @pytest.mark.parametrize(
     ("change", "what", "size"),
-    [
-        (of_date, "the equinox of RA and DEC", 2080.0),
-        (not_linear, "a non-linearity of E1 of", -4e-3),
-    ],
+    [(of_date, "the equinox of RA and DEC", 2080.0), (not_linear, "a non-linearity of E1 of", -4e-3)],
 )
 def test_one_number_is_among_those_that_are_told(change, what, size):
     """Others that do nearly the same are told beside it."""

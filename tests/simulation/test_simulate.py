@@ -28,12 +28,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import make_model, with_effects
-from walop_jax.simulation.observing_plan import (
-    NARROW_BANDS,
-    ObservingPlan,
-    filter_curve,
-    polariser_turn,
-)
+from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, filter_curve, polariser_turn
 from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, true_instrument, truth_values
 from walop_jax.sky.moon import body_direction
 
