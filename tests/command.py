@@ -34,3 +34,12 @@ def run_program(*args: object) -> Any:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result
+
+
+def one_line(result) -> str:
+    """The error of a command that failed with exit code 1."""
+    assert result.exit_code == 1, result.output
+    assert "Traceback" not in result.output
+    errors = [line for line in result.stderr.splitlines() if line.startswith("walop-jax: error: ")]
+    assert len(errors) == 1, result.stderr
+    return errors[0]

@@ -13,6 +13,7 @@ import numpy as np
 from walop_jax.data.records import FilterCurve, Sources
 from walop_jax.likelihood import engine
 from walop_jax.model.effects.base import Context, Effect
+from walop_jax.model.effects.optics import AXES
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan, with_median
 from walop_jax.model.planning import plan_for
@@ -37,6 +38,53 @@ EXPOSURES = builders.exposures(
 )
 CONTEXT = Context(exposures=9, moon=(4, 5), moon_ids=(4, 5), sources=tuple(s[0] for s in STARS))
 MEDIAN = np.full((9, 4), 2e5) * np.array([1.0, 1.1, 0.9, 1.2])
+# Every kind of change, every factor that the scene can show, every side of a place.
+EVERY_CHANGE = (
+    *(f"{kind} {axis} behind collimator" for kind in ("retardance", "diattenuation") for axis in AXES),
+    "depolarisation behind collimator",
+    "turn of polariser * x",
+    "turn ahead of half1.plate * y",
+    "turn of polariser * x2-y2 * sin 1 CLP",
+    "depolarisation of polariser * cos 2 CLP",
+    "diattenuation v of polariser * xy",
+    "retardance radial of polariser",
+    "retardance u of chwp * cos 2 CHWP",
+    "depolarisation behind chwp * kelvin",
+    "depolarisation q behind collimator * x",
+    "depolarisation u of polariser",
+    "depolarisation v of chwp * cos 2 CHWP",
+    "retardance v ahead of half2.plate * hours",
+    "diattenuation diagonal ahead of half1.plate * colour",
+    "added polarisation q ahead of polariser",
+    "added polarisation u behind collimator",
+    "diattenuation q ahead of polariser * r2",
+    "displacement x ahead of pupil * hour angle",
+    "displacement y ahead of pupil",
+    "fringes of half1.plate * gap 2.5",
+    "shift of band",
+    "rotator of sky",
+    "extinction of polariser",
+    "ellipticity of polariser",
+    "axis of half2.plate",
+    "axis of half1.plate.mgf2",
+    "cut of half1.plate.quartz",
+    "thickness of half2.plate.mgf2",
+    "thermal of half1.plate",
+    "polarisation of sky",
+    "polarisation q of sky * exposure 4",
+    "polarisation u of blue_star",
+    "gain of O1 * r2",
+    "gain of half2 * ring 3",
+    "gain of O2 * exposure 3",
+    "gain of E2 * kind moon",
+    "gain of E1 * hours 1 to 3",
+    "gain of E2 * counts",
+    "reported gain of O1 * hours",
+    "light in E1 * hours",
+    "light of E1 in O1",
+    "light of opposite in O2",
+    "afterglow in O1",
+)
 SOURCE = np.array([-1] * 6 + [0, 1, -1])
 SKY = np.array([[0.10, 0.02], [-0.05, 0.08]])
 

@@ -15,11 +15,7 @@ from walop_jax.calibration.product import write_calibration
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import InputFile, Points, Site, Sources
 from walop_jax.diagnosis.detection_limits import DetectionLimit, DetectionLimits
-from walop_jax.diagnosis.figure_data import (
-    DiagnosisFigureData,
-    ResidualComparison,
-    write_figure_data,
-)
+from walop_jax.diagnosis.figure_data import DiagnosisFigureData, ResidualComparison, write_figure_data
 from walop_jax.fit.verdict import Verdict
 from walop_jax.io.display import Display
 from walop_jax.io.text import json_text
@@ -146,12 +142,7 @@ def comparison(effect: str, size: float = 6.0) -> ResidualComparison:
             "RMS_BEFORE": np.abs(before) + 0.9,
             "RMS_AFTER": np.full((9, 4), 0.9),
         },
-        curves={
-            "BEFORE": wave,
-            "ERROR": np.full((8, 4), 0.05),
-            "AFTER": np.zeros((8, 4)),
-            "EXPLAINED": wave,
-        },
+        curves={"BEFORE": wave, "ERROR": np.full((8, 4), 0.05), "AFTER": np.zeros((8, 4)), "EXPLAINED": wave},
     )
 
 

@@ -409,38 +409,6 @@ def test_kinds_and_factors_of_descriptions_are_in_their_tables():
     assert [one for one in (*PLAIN, *", ".join(FORMS).split(", ")) if f"`{one}`" not in page] == []
 
 
-def test_effects_with_parameters_units_and_widths():
-    from walop_jax.model.effects import EFFECTS
-
-    told: dict[str, dict[str, tuple[str, float | None]]] = {}
-    name = ""
-    for row in rows(section("effects", "The catalogue of effects")):
-        name = row[0] or name
-        parameters = told.setdefault(name, {})
-        if row[1] != "none":
-            parameters[row[1]] = row[2], float(row[3]) if row[3] else None
-    assert told == {
-        kind.name: {field: (d.unit, d.width) for field, d in kind.numbers().items()} for kind in EFFECTS
-    }
-
-
-@pytest.mark.parametrize(
-    ("effect", "choice"),
-    [
-        ("blemish", "camera"),
-        ("camera_gain_drift", "camera"),
-        ("hwp1_axis_cut", "crystal"),
-        ("standard_outlier", "source"),
-    ],
-)
-def test_choices_of_effects(effect, choice):
-    from walop_jax.model.effects import Context, effect_by_name
-
-    assert choice in effect_by_name(effect).neutral(Context(sources=("HD1",))).choices()
-    told = next(row for row in rows(section("effects", "The catalogue of effects")) if row[0] == effect)
-    assert f"choice: `{choice}`" in told[4]
-
-
 def test_effects_that_look_alike_exist():
     from walop_jax.model.effects import EFFECTS
 

@@ -58,9 +58,15 @@ QUESTION = re.compile(r"(what|whether|where|how|who|which)\b", re.IGNORECASE)  #
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 
 
+@functools.cache
 def files() -> list[Path]:
     """All but the configuration of the site, which only Sphinx reads."""
     return sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "docs" / "conf.py"})
+
+
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
 
 
 def room_of(module: str) -> str | None:
@@ -85,9 +91,9 @@ def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[int,
 
 def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
     """What a module does that the house forbids."""
-    room = room_of(module)
+    room, tree = room_of(module), ast.parse(source)
     found = []
-    for line, name in imports(ast.parse(source), module, is_package):
+    for line, name in imports(tree, module, is_package):
         top = name.split(".")[0]
         where = f"{module}:{line}"
         if top == PACKAGE.name:
@@ -105,7 +111,7 @@ def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
         if top in STRANGERS:
             found.append(f"{where}: {top} has no business in the package")
     if room != "commands":
-        for node in ast.walk(ast.parse(source)):
+        for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
                 found.append(f"{module}:{node.lineno}: prints; that is the business of commands")
     return found
@@ -129,7 +135,7 @@ def test_no_room_calls_upward_through_a_string():
     for path in files():
         module = module_name(path)
         room = room_of(module)
-        for node in ast.walk(ast.parse(path.read_text())) if room else ():
+        for node in ast.walk(tree_of(path)) if room else ():
             if isinstance(node, ast.Constant) and re.fullmatch(r"walop_jax(\.\w+){2,}", str(node.value)):
                 target = room_of(str(node.value))
                 if target in ROOMS and ROOMS.index(target) > ROOMS.index(room):
@@ -163,7 +169,7 @@ def followed() -> dict[str, set[str]]:
     public = {a.asname: n.module for n in stub.body if isinstance(n, ast.ImportFrom) for a in n.names}
     modules, edges = {module_name(path): path for path in files()}, {}
     for module, path in modules.items():
-        tree = _AtRunTime().visit(ast.parse(path.read_text()))
+        tree = _AtRunTime().visit(ast.parse(path.read_text()))  # which changes it
         names = [name for _, name in imports(tree, module, path.name == "__init__.py")]
         names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names if "." in name]
         homes = (name if name in modules else name.rpartition(".")[0] for name in names)
@@ -226,7 +232,7 @@ def questions(tree: ast.AST) -> list[str]:
 
 
 def test_docstrings_open_with_what_comes_back():
-    assert {str(path): found for path in files() if (found := questions(ast.parse(path.read_text())))} == {}
+    assert {str(path): found for path in files() if (found := questions(tree_of(path)))} == {}
     assert (
         len(questions(ast.parse('"""What it is."""\nN = 1\n"""How many."""\ndef f():\n    "True if so."')))
         == 2
@@ -242,7 +248,7 @@ def test_every_library_is_declared():
     used = {
         name.split(".")[0]: module_name(path)
         for path in files()
-        for _, name in imports(ast.parse(path.read_text()), module_name(path), path.name == "__init__.py")
+        for _, name in imports(tree_of(path), module_name(path), path.name == "__init__.py")
     }
     missing = set(used) - declared - set(sys.stdlib_module_names) - {PACKAGE.name}
     assert {name: used[name] for name in missing} == {}
@@ -319,7 +325,7 @@ def test_machine_paths_are_recognised():
 def test_a_name_of_a_class_means_one_thing():
     homes: dict[str, set[str]] = {}
     for path in files():
-        for node in ast.parse(path.read_text()).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, set()).add(str(path.relative_to(PACKAGE)))
     assert {name: sorted(found) for name, found in homes.items() if len(found) > 1} == {}

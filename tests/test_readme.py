@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from walop_jax.commands import COMMANDS
-
 ROOT = Path(__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -24,12 +22,6 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
 
 def test_it_is_short():
     assert len(TEXT.split()) <= 900
-
-
-def test_commands_exist():
-    named = set(re.findall(r"(?:^|`|&& )walop-jax ([a-z][a-z-]+)", TEXT, re.MULTILINE))
-    assert len(named) > 5
-    assert named <= set(COMMANDS)
 
 
 def test_links_and_files_exist():

@@ -93,17 +93,6 @@ def test_words(path):
         assert content_of(hdus) == held
 
 
-@pytest.mark.parametrize("word", ["STRUCTG", "STRUCTR", "MJD-BEG", "SITEELEV", "MAPFILT", "CONTHASH"])
-def test_words_of_the_primary_header(path, word):
-    assert refused(changed(path, lambda hdus: hdus[0].header.set(word, other(hdus[0].header[word]))))
-    assert refused(changed(path, lambda hdus: hdus[0].header.remove(word)))
-
-
-@pytest.mark.parametrize("word", ["HIDE1", "SIZE2", "UNIT2"])
-def test_words_of_hidden_mistakes(path, word):
-    assert refused(changed(path, lambda h: h["HIDDEN"].header.set(word, other(h["HIDDEN"].header[word]))))
-
-
 @pytest.mark.parametrize("word", ["DATE", "CREATOR", "SOFT1"])
 def test_words_that_enter_no_number(path, word):
     before = read_product(path)

@@ -164,6 +164,8 @@ def test_blanks_in_a_name_stay(calset, tmp_path):
             r"HWP_ANGLE: is not finite in row 1",
         ),
         (lambda h: h[0].header.set("PRODVERS", 1), "not what was written"),
+        (lambda h: h.__delitem__("RESIDUAL_ERR"), "RESIDUAL_ERR.*missing"),
+        (lambda h: h.__delitem__("RESIDUAL_CHI2"), "RESIDUAL_CHI2.*missing"),
     ],
 )
 def test_what_is_not_as_written_is_refused(calset, tmp_path, change, message):
@@ -198,22 +200,3 @@ def test_quality_in_words():
         assert text in meaning
     assert len(Quality(16 | 8192).meanings) == 2
     assert Quality(0).meanings == ()
-
-
-@pytest.mark.parametrize("name", ["RESIDUAL_ERR", "RESIDUAL_CHI2"])
-def test_a_map_with_a_part_missing_is_refused(calset, tmp_path, name):
-    write_calibration(tmp_path / "p.fits", product_of(calset, 2, {}))
-    with fits.open(tmp_path / "p.fits") as hdus:
-        del hdus[name]
-        hdus.writeto(tmp_path / "short.fits")
-    with pytest.raises(DataError, match=f"{name}.*missing"):
-        read_product(tmp_path / "short.fits")
-
-
-def test_a_changed_map_is_found_out(calset, tmp_path):
-    write_calibration(tmp_path / "p.fits", product_of(calset, 2, {}))
-    with fits.open(tmp_path / "p.fits") as hdus:
-        hdus["RESIDUAL"].data[0, 0, 0] += 1.0
-        hdus.writeto(tmp_path / "changed.fits", checksum=True)
-    with pytest.raises(DataError, match="not what was written"):
-        read_product(tmp_path / "changed.fits")

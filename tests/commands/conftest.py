@@ -16,8 +16,6 @@ from command import call, no_cache
 from small_run import SEED, SMALL
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import write_calibration
-from walop_jax.calibration.summary import summary
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.refit import refit
@@ -41,13 +39,15 @@ class FittedSet:
 @pytest.fixture(scope="session")
 def fitted(calset_file, tmp_path_factory) -> FittedSet:
     run = tmp_path_factory.mktemp("fitted") / "RUN"
-    calset = read_calibration_set(calset_file)
-    result = refit(calset).judged()
-    calibration = Calibration.from_fit(result)
-    run.mkdir()
-    write_calibration(run / "calibration.fits", calibration)
-    (run / "summary.json").write_text(json.dumps(summary(result, seconds=1.0)))
-    return FittedSet(calset_file, calibration, run)
+    result = refit(read_calibration_set(calset_file)).judged()
+    result.save(run)
+    return FittedSet(calset_file, Calibration.from_fit(result), run)
+
+
+@pytest.fixture(scope="session")
+def run(fitted) -> Path:
+    """The folder of that fit."""
+    return fitted.run
 
 
 @pytest.fixture(scope="session")
@@ -63,15 +63,6 @@ def spoilt_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("sets") / "spoilt.fits"
     effect = effect_by_name("clp_wobble").of(SMALL.context(), amplitude=0.3, phase=1.0)
     write_calibration_set(path, simulate(SMALL, seed=SEED, effects=(effect,)).calset)
-    return path
-
-
-@pytest.fixture(scope="session")
-def run(call, calset_file, tmp_path_factory) -> Path:
-    """A finished `refit`."""
-    path = tmp_path_factory.mktemp("runs") / "run"
-    result = call("refit", calset_file, "-o", path, "--quiet")
-    assert result.exit_code == 0, result.output
     return path
 
 

@@ -30,12 +30,6 @@ def catalogue(path, rows=6, **columns):
     return path
 
 
-def one_line(result) -> str:
-    assert result.exit_code == 1
-    assert result.stderr.count("\n") == 1
-    return result.stderr
-
-
 @pytest.mark.parametrize("suffix", [".fits", ".csv", ".ecsv"])
 def test_apply_adds_columns(call, run, tmp_path, suffix):
     source = catalogue(tmp_path / f"c{suffix}", ROTATOR=20.0)
@@ -66,22 +60,6 @@ def test_other_estimator_and_combined_rows(call, run, tmp_path):
     assert len(set(table["Q"].tolist())) == 3
     assert table.meta["PESTIM"].startswith("Wardle")
     assert table.meta["QUFRAME"] == "instrument"
-
-
-def test_errors_name_what_is_wrong(call, run, tmp_path):
-    good = catalogue(tmp_path / "c.fits")
-    assert call("apply", run, good, "-o", tmp_path / "o.fits", "--debias", "MLE").exit_code == 2
-    assert call("apply", run, good, "-o", tmp_path / "o.fits", "--saturation", "-1").exit_code == 2
-    assert "no such file" in one_line(call("apply", run, tmp_path / "none.fits", "-o", tmp_path / "o.fits"))
-    line = one_line(
-        call("apply", run, catalogue(tmp_path / "f.fits", FILTER="SDSS-q"), "-o", tmp_path / "o.fits")
-    )
-    assert "f.fits" in line
-    assert "SDSS-r" in line
-    call("apply", run, good, "-o", tmp_path / "o.fits")
-    before = (tmp_path / "o.fits").read_bytes()
-    assert "exists already" in one_line(call("apply", run, good, "-o", tmp_path / "o.fits"))
-    assert (tmp_path / "o.fits").read_bytes() == before
 
 
 def test_rows_that_hold_nothing_are_said(call, run, tmp_path):

@@ -140,25 +140,12 @@ def test_apply_is_the_table_of_the_command(call, fitted, tmp_path):
     np.testing.assert_array_equal(split["Q"], found["Q"])
 
 
-def test_trace_ends_with_the_counts_of_the_command(call, fitted):
-    text = call("trace", fitted.run, "--x", "0.1", "--q", "0.03").output.splitlines()[-1]
-    counts = walop.trace(fitted.run, x=0.1, q=0.03)[-1].value[0]
-    assert [f"{value:.6f}" for value in counts] == text.split()[1:5]
-
-
 @pytest.mark.long
 def test_limits_as_a_table():
     zero = walop.effect_by_name("clp_zero")
     table = walop.limits(small_fit(), effects=(zero,)).to_table()
     assert table["EFFECT"].tolist() == ["clp_zero"]
     assert 0 < table["DETECTED"][0, 0] < 0.1  # deg
-
-
-def test_certify_and_epoch(fitted):
-    assert {check.name for check in walop.certify(fitted.run).checks} >= {"converged", "physics"}
-    found = walop.epoch(fitted.run, fitted.calset)
-    assert found.fits
-    assert found.test < 1e-3 * found.directions  # the same data
 
 
 def test_calls_are_logged_and_silent_otherwise(fitted, caplog, capsys):

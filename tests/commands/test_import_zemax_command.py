@@ -54,12 +54,6 @@ def test_nothing_is_half_written(call, folder, tmp_path):
     assert result.stderr.startswith(f"walop-jax: error: {path}, line ")
     assert [entry.name for entry in tmp_path.iterdir()] == ["exports"]
 
-    output.write_text("mine")
-    result = call("import-zemax", folder, "-o", output)
-    assert result.exit_code == 1
-    assert "exists already" in result.stderr
-    assert output.read_text() == "mine"
-
 
 @pytest.mark.parametrize(
     "options",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -15,9 +14,8 @@ from frame_run import raster
 from frames_file import write_frames
 
 from walop_jax.calibration.matrix import residual_names
-from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.calibration.product import read_product
 from walop_jax.likelihood import limits
-from walop_jax.reports import figures
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -74,34 +72,6 @@ def test_the_calibration_carries_a_residual_map(finished):
         assert first == pytest.approx(-RUN.field + 3.5 * 2 * RUN.field / (SIDE - 1))
     # Passes over all pixels: from the minimum of a sample, and another where that led.
     assert summary["steps"] <= 3
-
-
-@pytest.mark.long
-def test_the_map_stays_with_the_calibration(finished, tmp_path):
-    product = read_product(finished[0] / "calibration.fits")
-    again = product.rebuilt()
-    assert again.content_hash() == product.content_hash()
-    # A copy forgets how the file held it: its maps are computed anew, by a program that came another way.
-    fresh = dataclasses.replace(again).maps
-    np.testing.assert_allclose(fresh.values, product.maps.values, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(fresh.errors, product.maps.errors, rtol=1e-9, atol=0)
-    write_calibration(tmp_path / "copy.fits", again)
-    copy = read_product(tmp_path / "copy.fits")
-    assert copy.content_hash() == again.content_hash()
-    np.testing.assert_array_equal(copy.residuals.values, product.residuals.values)
-    figure = figures.residual_map_figure(product.residuals, ("O1", "E1", "O2", "E2"))
-    assert len(figure.axes) == 16
-
-
-@pytest.mark.long
-def test_small_memory_changes_nothing(call, frames, tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
-    monkeypatch.setattr(limits, "SAMPLE", 1024)
-    found = [
-        json.loads(call("refit", frames, "-o", tmp_path / memory, "--memory", memory, "--json").stdout)
-        for memory in ("4", "0.1")
-    ]
-    assert found[0]["parameters"] == found[1]["parameters"]
 
 
 @pytest.mark.long

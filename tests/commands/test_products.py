@@ -10,21 +10,11 @@ import numpy as np
 import pytest
 
 import walop_jax as walop
-from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.settings import Settings, builtin_filter
 from walop_jax.io.errors import DataError
 from walop_jax.model.trace import Sightline, trace
 
 from .conftest import FittedSet
-
-
-def test_a_certificate_fails_closed(fitted: FittedSet, tmp_path: Path):
-    product = read_product(fitted.run / "calibration.fits")
-    changed = dataclasses.replace(product.maps, values=product.maps.values + 1e-3)
-    write_calibration(tmp_path / "c.fits", dataclasses.replace(product, maps=changed))
-    found = walop.certify(tmp_path / "c.fits")
-    assert [check.name for check in found.failed] == ["maps"]
-    assert found.document()["valid"] is False
 
 
 def test_epochs_of_one_and_the_same_set(fitted: FittedSet, tmp_path: Path):
@@ -81,8 +71,3 @@ def test_light_is_traced_through_what_was_fitted(fitted: FittedSet):
         walop.trace(instrument="WALOP-SUOTH")
     with pytest.raises(DataError, match="SDSS-rr"):
         walop.trace(fitted.run, filter="SDSS-rr")
-
-
-def test_the_base_model_and_a_run_have_the_same_sources(fitted: FittedSet):
-    assert walop.cite() == walop.cite(fitted.run) == walop.cite(fitted.run / "calibration.fits")
-    assert any("Yeh 1980" in entry.source for entry in walop.cite())

@@ -6,13 +6,7 @@ import json
 
 import handmade_run
 import pytest
-
-
-def one_line(result) -> str:
-    assert result.exit_code == 1, result.output
-    errors = [line for line in result.stderr.splitlines() if line.startswith("walop-jax: error: ")]
-    assert len(errors) == 1, result.stderr
-    return errors[0]
+from command import one_line
 
 
 def test_page_appears_in_the_run_and_replaces_nothing_but_itself(call, tmp_path):
@@ -46,21 +40,3 @@ def test_what_is_no_run_is_refused_with_advice(call, tmp_path, name):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
     assert "give the RUN of walop-jax refit or diagnose" in one_line(call("report", tmp_path / name))
-
-
-def test_a_real_run_has_a_page(call, run, tmp_path):
-    assert call("report", run, "-o", tmp_path / "page.html").exit_code == 0
-    text = (tmp_path / "page.html").read_text()
-    assert "half2.plate.mgf2" in text
-    assert "Fit of WALOP-SOUTH: trusted" in text
-
-
-@pytest.mark.long
-def test_a_real_diagnosis_has_its_pictures_and_its_page(call, spoilt_file, tmp_path):
-    folder = tmp_path / "run"
-    assert call("diagnose", spoilt_file, "-o", folder, "--quiet").exit_code == 0
-    assert sorted(entry.name for entry in folder.iterdir()) == [
-        "calibration.fits", "diagnosis.fits", "diagnosis.json", "model.toml", "summary.json",
-    ]  # fmt: skip
-    assert json.loads(call("report", folder, "--json").stdout)["missing"] == []
-    assert "clp_wobble: χ²" in (folder / "report.html").read_text()

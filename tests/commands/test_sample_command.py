@@ -13,20 +13,15 @@ from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.posterior.draws import read_draws
 
+from .conftest import FittedSet
+
 OWN = f"{Path(__file__).resolve().parents[1] / 'posterior' / 'random_walk.py'}:Metropolis"
 
 
-@pytest.fixture(scope="module")
-def run_folder(call, calset_file: Path, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "RUN"
-    assert call("refit", calset_file, "-o", folder, "-q").exit_code == 0
-    return folder
-
-
 @pytest.mark.long
-def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: Path):
+def test_sample_writes_everything_and_resumes(call, fitted: FittedSet, tmp_path: Path):
     run = tmp_path / "RUN"
-    shutil.copytree(run_folder, run)
+    shutil.copytree(fitted.run, run)
     before = read_product(run / "calibration.fits")
     short = call("sample", run, "--moves", "laplace", "--interval", 40, "--maximum-steps", 80)
     assert short.exit_code == 1
@@ -71,11 +66,11 @@ def test_sample_writes_everything_and_resumes(call, run_folder: Path, tmp_path: 
     np.testing.assert_allclose(drawn["M32"], linear["M32"], atol=float(max(linear["M32_ERR"])))
 
 
-def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tmp_path: Path):
+def test_sample_says_what_is_wrong(call, fitted: FittedSet, calset_file: Path, tmp_path: Path):
     assert "not a folder" in call("sample", calset_file).stderr
     assert call("sample", tmp_path).exit_code == 1
     run = tmp_path / "RUN"
-    shutil.copytree(run_folder, run)
+    shutil.copytree(fitted.run, run)
     model = tmp_path / "model.toml"
     model.write_text('[model]\neffects = ["clp_zero"]\n')
     refused = call("sample", run, "--model", model)
@@ -88,10 +83,10 @@ def test_sample_says_what_is_wrong(call, run_folder: Path, calset_file: Path, tm
 
 
 @pytest.mark.long
-def test_a_sampler_of_ones_own(call, run_folder: Path, tmp_path: Path):
+def test_a_sampler_of_ones_own(call, fitted: FittedSet, tmp_path: Path):
     """A file from outside the package: sampled, resumed, refused to another sampler, and on the page of the run."""
     run = tmp_path / "RUN"
-    shutil.copytree(run_folder, run)
+    shutil.copytree(fitted.run, run)
     short = ("--sampler", OWN, "--interval", 250)
     done = call("sample", run, *short, "--maximum-steps", 250)
     assert done.exit_code == 1, done.stderr
@@ -112,11 +107,11 @@ def test_a_sampler_of_ones_own(call, run_folder: Path, tmp_path: Path):
 
 
 @pytest.mark.long
-def test_nuts_from_the_command_line(call, run_folder: Path, tmp_path: Path):
+def test_nuts_from_the_command_line(call, fitted: FittedSet, tmp_path: Path):
     """The exact posterior, converged: covariance into the product, matrices by draws, the page."""
     pytest.importorskip("blackjax")
     run = tmp_path / "RUN"
-    shutil.copytree(run_folder, run)
+    shutil.copytree(fitted.run, run)
     before = read_product(run / "calibration.fits")
     done = call("sample", run, "--sampler", "nuts", "--json")
     assert done.exit_code == 0, done.stderr

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,70 +9,15 @@ import pytest
 
 from walop_jax.calibration.product import read_product
 from walop_jax.commands.refit import refit
-from walop_jax.commands.sample import OUTPUTS, sample
+from walop_jax.commands.sample import sample
 from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.io.errors import DataError
 from walop_jax.posterior.run import Run
 
-from .conftest import FittedSet, assert_same_files
+from .conftest import FittedSet
 
 STEPS = 300  # 400 are enough
 OPTIONS = {"interval": 100, "maximum_steps": STEPS, "moves": "laplace"}
-
-
-def copied(fitted: FittedSet, folder: Path) -> Path:
-    return Path(shutil.copytree(fitted.run, folder))
-
-
-@pytest.mark.long
-def test_an_interrupted_run_goes_on_as_if_nothing_had_been(
-    call, fitted: FittedSet, tmp_path: Path, monkeypatch
-):
-    command, caller = copied(fitted, tmp_path / "command"), copied(fitted, tmp_path / "caller")
-    options = ("--interval", 100, "--maximum-steps", STEPS, "--moves", "laplace", "--quiet")
-    assert call("sample", command, *options).exit_code == 1  # so few steps do not converge
-
-    told: list[str] = []
-
-    def interrupt(text: str) -> None:
-        told.append(text)
-        if sum(entry.startswith("sampling") for entry in told) == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sample(caller, **OPTIONS, progress=interrupt)
-    assert {entry.partition(":")[0] for entry in told} == {"tabulating the model", "starting", "sampling"}
-    assert "τ" in told[-1]
-    assert not any((caller / name).exists() for name in OUTPUTS)
-    assert [path.name for path in (caller / "sampling").iterdir()] == ["chain.h5"]
-
-    with pytest.raises(DataError, match="holds a chain already"):
-        sample(caller, **OPTIONS)
-    found = sample(caller, **OPTIONS, resume=True)
-    assert not found.trusted
-    assert read_product(caller / "calibration.fits").verdict.covariance_from == "fit"
-    assert_same_files(command, caller, but=("sampling", "summary.json"))
-
-    with pytest.raises(DataError, match=r"holds posterior\.nc already"):
-        sample(caller, **OPTIONS)
-
-    # On to convergence; the files of a posterior that is to be trusted appear together or not at all.
-    before = {name: (caller / name).read_bytes() for name in (*OUTPUTS, "calibration.fits")}
-    more = OPTIONS | {"maximum_steps": 100_000}
-
-    def fail(*args: object) -> None:
-        raise OSError("No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("walop_jax.calibration.write_calibration", fail)
-        with pytest.raises(DataError, match="the old content is untouched"):
-            sample(caller, **more, resume=True)
-    assert {name: (caller / name).read_bytes() for name in before} == before
-    found = sample(caller, **more, resume=True)
-    assert found.trusted
-    product = read_product(caller / "calibration.fits")
-    assert product.verdict.covariance_from == "posterior"
-    np.testing.assert_array_equal(product.covariance, found.covariance)
 
 
 @pytest.mark.long

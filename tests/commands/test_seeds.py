@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,8 +48,3 @@ def test_so_does_that_of_a_diagnosis(monkeypatch):
     fit = small_fit().judged()
     workflow.diagnose(fit.calset, fit.model, catalogue=(), seed=7, minutes=0.0)
     assert set(seeds) == {7}
-
-
-def test_it_is_written_down(fitted: FittedSet, tmp_path: Path):
-    walop.refit(fitted.calset, output=tmp_path / "RUN", seed=5)
-    assert walop.read(tmp_path / "RUN").documents["summary"]["seed"] == 5

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.io.errors import DataError
@@ -25,17 +23,6 @@ polariser_angles = 4
 moon_patches = 2
 standards = 3
 """
-
-
-def test_a_simulated_set(tmp_path: Path):
-    wobble = {"clp_wobble": {"amplitude": 0.06, "phase": 1.1}}
-    made = walop.simulate(SMALL, effect=wobble, seed=3, truth=tmp_path / "truth.json")
-    # 4 polariser angles and 2 Moon patches at 9 points, 3 standards at one place.
-    counted = (len(made.calset.points), len(made.calset.exposures), made.calset.intensities.rows)
-    assert counted == (10, 9, 57)
-    truth = json.loads((tmp_path / "truth.json").read_text())
-    assert truth["parameters"]["clp_wobble.phase"]["value"] == 1.1
-    assert truth["seed"] == 3
 
 
 def test_an_effect_may_be_a_dict_a_text_or_an_object_and_a_plan_a_file(tmp_path: Path):
@@ -70,16 +57,6 @@ def test_neither_set_nor_truth_after_an_exception(tmp_path: Path, monkeypatch, e
     with pytest.raises(type(error) if isinstance(error, KeyboardInterrupt) else DataError):
         walop.simulate(SMALL, output=tmp_path / "set.fits", truth=tmp_path / "truth.json")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_imported_set(tmp_path: Path):
-    exports = write_folder(tmp_path / "exports")
-    (exports / "Config_2" / "transmission_field1_pol3.txt").unlink()
-    found = walop.import_zemax(exports, error=0.01, cameras=(1, 3, 2, 4))
-    assert (found.instrument, found.intensities.rows, len(found.points)) == ("WALOP-NORTH", 30, 3)
-    assert any("are left out" in remark for remark in found.remarks)
-    with pytest.raises(ValueError, match="not a share"):
-        walop.import_zemax(exports, error=-1.0)
 
 
 def test_sets_are_inspected_one_by_one_and_as_one(fitted: FittedSet, tmp_path: Path):

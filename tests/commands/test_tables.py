@@ -42,18 +42,6 @@ def catalogue(tmp_path: Path) -> Path:
     return tmp_path / "stars.fits"
 
 
-def test_a_table_of_matrices(call, fitted: FittedSet, points: Path, tmp_path: Path):
-    done = call("matrix", fitted.run, "--points", points, "-o", tmp_path / "o.fits", "--json")
-    found = json.loads(done.stdout)
-    assert (found["rows"], found["trusted"], found["flags"]["32"]) == (3, True, 1)
-    assert "points.csv: 1 point(s) beyond the calibrated field" in done.stderr
-    assert found["product"] == fitted.calibration.content_hash()
-    values, covariance = fitted.calibration.matrix(np.array([0.0, 0.2, 0.33]), np.array([0.0, -0.1, 0.0]))
-    table = Table.read(tmp_path / "o.fits")
-    np.testing.assert_allclose(table["M32"], values[:, 4], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(table["M32_ERR"], np.sqrt(covariance[:, 4, 4]), rtol=1e-9)
-
-
 @pytest.fixture
 def drifting(fitted: FittedSet, tmp_path: Path) -> Path:
     """The folder of a run whose model has a drift of single exposures, at the values of the fit."""

@@ -80,10 +80,6 @@ def test_cite_as_bibtex(call):
         assert {"author", "title", "year"} <= set(re.findall(r"^\s*(\w+)\s*=", body, re.MULTILINE)), key
 
 
-def test_an_output_that_exists_names_the_option(call, calset_file, run):
-    assert "--overwrite" in call("refit", calset_file, "-o", run).output
-
-
 @pytest.mark.parametrize(
     ("effect", "words"),
     [("clp_wobble=amp:0.06", ("'amp'", "amplitude, phase")), ("clp_wobbel=1", ("clp_wobble",))],

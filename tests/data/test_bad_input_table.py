@@ -98,11 +98,11 @@ row("20", "two polariser angles", "E", "at least 3")(angles(0.0, 90.0, 0.0, 90.0
 row("21", "angles within 30°", "F", "all polariser angles lie within")(angles(0.0, 6.0, 12.0, 18.0, 24.0))
 row("23", "a point outside the field", "E", "[POINTS] Y: lies outside ±0.35°")(put(P, "Y", 1, 0.4))
 row("27", "no instrument", "E", "[PRIMARY] INSTRUME")(lambda made: made.header.pop("INSTRUME"))
-row("27", "an unknown filter", "E", "'SDSS-R'")(put(E, "FILTER", 2, "SDSS-R"))
+row("27", "an unknown filter", "E", "[EXPOSURES] FILTER: 'SDSS-R'")(put(E, "FILTER", 2, "SDSS-R"))
 row("32", "text in a column of numbers", "E", "holds strings")(
     columns(P, X=["4A", None, np.array(["1", "b", "2"])])
 )
-row("39", "constant data", "E", "all counts are equal")(put(I, "N", slice(None), 5.0))
+row("39", "constant data", "E", "[INTENSITIES] N: all counts are equal (5)")(put(I, "N", slice(None), 5.0))
 
 
 @row("11", "columns in another order", "S")

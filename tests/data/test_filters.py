@@ -34,16 +34,6 @@ def test_sdss_r_is_the_published_table():
     assert published == {w: t for w, t in zip(every_20, curve.throughput, strict=True) if w in published}
 
 
-def test_effective_wavelength_of_sdss_r():
-    """Doi et al. 2010: about 616.5 nm, half maxima near 559 and 675 nm."""
-    curve = builtin_filter("SDSS-r")
-    half = curve.wavelength[curve.throughput > curve.throughput.max() / 2]
-    assert half[0] == pytest.approx(0.559, abs=0.003)
-    assert half[-1] == pytest.approx(0.675, abs=0.003)
-    weight = np.gradient(curve.wavelength) * curve.throughput
-    assert np.average(curve.wavelength, weights=weight) == pytest.approx(0.6165, abs=0.003)
-
-
 def test_unknown_filter():
     with pytest.raises(DataError, match=r"'sdss-r'; .*; did you mean 'SDSS-r'\?"):
         builtin_filter("sdss-r")

@@ -164,19 +164,6 @@ def test_truth_values_of_flags_are_bad_pixels(handmade):
     assert inspect(calset).flags == {"bad pixel": 1}
 
 
-def test_slightly_negative_counts_are_kept(handmade):
-    handmade.values("INTENSITIES", "N")[8] = [-30.0, 20.0, 5.0, 0.0]
-    handmade.values("INTENSITIES", "N_ERR")[8] = 30.0
-    calset = read_calibration_set(handmade.write())
-    assert calset.intensities.rows == 24
-
-
-def test_an_exposure_without_data_is_remarked_on(handmade):
-    handmade.values("INTENSITIES", "FLAG")[3:6] = 1
-    calset = read_calibration_set(handmade.write())
-    assert any("no used row for exposure(s) 11" in remark for remark in calset.remarks)
-
-
 def test_plates_out_of_the_beam_have_no_angle(handmade):
     handmade.values("EXPOSURES", "CLP_ANGLE")[6] = 12.0
     calset = read_calibration_set(handmade.write())

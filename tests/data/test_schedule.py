@@ -24,22 +24,9 @@ from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_t
 
 FILTERS = {"SDSS-r": 1, "NB-660": 3}
 TYPES = [
-    "PAS",
-    "SCI",
-    "CAL-UPO",
-    "CAL-POL",
-    "CAL-MOO",
-    "CAL-CAL",
-    "TES-SOF",
-    "TES-HAR",
-    "TES-E2E",
-    "TES-TES",
-    "LAB-OPT",
-    "LAB-MEC",
-    "LAB-CCD",
-    "LAB-SOF",
-    "LAB-LAB",
-]
+    "PAS", "SCI", "CAL-UPO", "CAL-POL", "CAL-MOO", "CAL-CAL", "TES-SOF", "TES-HAR", "TES-E2E", "TES-TES", "LAB-OPT",
+    "LAB-MEC", "LAB-CCD", "LAB-SOF", "LAB-LAB",
+]  # fmt: skip
 TIME = r"([01]\d|2[0-3]):[0-5]\d:[0-5]\d"
 PLAN = ObservingPlan(
     grid=2, standard_grid=1, polariser_angles=polariser_turn(4), moon_patches=2, standards=3,

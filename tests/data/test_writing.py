@@ -147,12 +147,6 @@ def test_a_file_is_not_overwritten_unasked(handmade):
     assert path.read_bytes() != before
 
 
-def test_no_folder(handmade):
-    calset = read_calibration_set(handmade.write())
-    with pytest.raises(DataError, match="does not exist; create it first"):
-        write_calibration_set(handmade.folder / "absent" / "set.fits", calset)
-
-
 def test_a_name_that_fits_cannot_hold(handmade):
     calset = read_calibration_set(handmade.write())
     sources = dataclasses.replace(calset.sources, name=np.array(["βCas", "HD 1"]))

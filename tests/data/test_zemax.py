@@ -50,16 +50,7 @@ def test_outside_exports_give_the_outside_set(shared_data, tmp_path):
         (a, n, sigma), (b, n_single, sigma_single) = mine[key], hers[key]
         np.testing.assert_allclose(n_single, n, rtol=2.0**-24)  # half of the last bit in single precision
         np.testing.assert_allclose(sigma_single, sigma, rtol=2.0**-24)
-        for name in (
-            "kind",
-            "clp_in",
-            "exptime",
-            "temp",
-            "ha",
-            "ra",
-            "rotator",
-            "teff",
-        ):
+        for name in ("kind", "clp_in", "exptime", "temp", "ha", "ra", "rotator", "teff"):
             np.testing.assert_array_equal(
                 getattr(ours.exposures, name)[a], getattr(theirs.exposures, name)[b], name
             )

@@ -12,10 +12,7 @@ from small_run import SEED, SMALL, small_fit
 
 from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.detection_limits import (
-    DetectionLimits,
-    detection_limits,
-)
+from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
 from walop_jax.diagnosis.examination import Examination, examine
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import effective_trials, local_p

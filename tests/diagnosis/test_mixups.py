@@ -169,24 +169,20 @@ def test_every_mix_up_is_told_with_its_remedy(request, name):
 
 
 def test_the_other_sign_of_u_is_told():
-    """Of standards with as much u as q, in the sky of the truth: the catalogue has the other convention."""
-    made = simulate(PLAN, seed=8)
-    sources = made.calset.sources
-    assert np.abs(sources.u).max() > 0.02
-    bad = with_standards(made.calset, u=-sources.u)
-    found = mixups(bad, base_model(bad), left=1e5)
-    assert any(one.what == "U of SOURCES had the other sign" for one in found)
-    assert found[0].explained < 1.5
-
-
-def test_the_other_sign_of_u_of_a_single_star_is_told():
-    """A catalogue of several sources may have the other convention for one of its stars."""
+    """Of standards with as much u as q, in the sky of the truth: a catalogue, or one star, has the other convention."""
     calset = simulate(PLAN, seed=8).calset
-    star = int(np.argmax(np.abs(calset.sources.u)))
-    bad = with_standards(calset, u=np.where(np.arange(len(calset.sources)) == star, -1, 1) * calset.sources.u)
-    best = mixups(bad, base_model(bad), left=1e5)[0]
-    assert best.what == f"U of {calset.sources.name[star]} in SOURCES had the other sign"
-    assert best.explained < 1.5
+    sources = calset.sources
+    assert np.abs(sources.u).max() > 0.02
+    star = int(np.argmax(np.abs(sources.u)))
+    single = np.where(np.arange(len(sources)) == star, -1, 1)
+    for sign, what in (
+        (-1, "U of SOURCES had the other sign"),
+        (single, f"U of {sources.name[star]} in SOURCES had the other sign"),
+    ):
+        bad = with_standards(calset, u=sign * sources.u)
+        best = mixups(bad, base_model(bad), left=1e5)[0]
+        assert best.what == what
+        assert best.explained < 1.5
 
 
 def test_a_camera_with_one_number_everywhere_is_refused(without_plate):

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from walop_jax.diagnosis.score import (
-    Candidate,
-    Projector,
-    ScoreSpace,
-    corrected_p,
-    separations,
-)
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, corrected_p, separations
 
 ROWS, FREE = 400, 6
 

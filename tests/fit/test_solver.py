@@ -173,13 +173,7 @@ def test_the_steps_are_those_of_optimistix():
     start = np.array([-1.2, 1.0])
     for steps in (2, 5, 9):
         ours = minimise(rosenbrock(), start, np.ones(2), maximum_steps=steps)
-        theirs = optx.least_squares(
-            residuals,
-            solver,
-            jnp.asarray(start),
-            max_steps=steps,
-            throw=False,
-        )
+        theirs = optx.least_squares(residuals, solver, jnp.asarray(start), max_steps=steps, throw=False)
         assert bool(theirs.result == optx.RESULTS.nonlinear_max_steps_reached)
         assert ours.steps == steps
         np.testing.assert_allclose(ours.x, theirs.value, rtol=1e-10)

@@ -110,16 +110,6 @@ def test_twenty_runs_as_large_as_a_real_one():
     assert abs(found.excess.mean()) < 1.0
 
 
-@pytest.mark.long  # of a single run, against the truth of other code: tests/calibration/test_calibration.py
-def test_three_small_runs():
-    found = study(SMALL, range(3))
-    # 210 pulls, of which every set shares its noise: about three standard deviations of mean and rms.
-    assert abs(found.pulls.mean()) < 0.25
-    assert 0.8 < np.sqrt((found.pulls**2).mean()) < 1.2
-    assert found.ratio.mean() < 1.4
-    assert np.all(np.abs(found.excess) < 4.0)
-
-
 # ----------------------------------------------------------------------------------------- exact properties
 
 

@@ -80,12 +80,6 @@ def test_measured_u_is_the_papers(delta):
     np.testing.assert_allclose(vectors[2] - vectors[3], expected_u, atol=1e-12)
 
 
-def test_quarter_wave_mixes_q_u_and_v_equally():
-    """Paper II: u_m = q/2 + u/2 − v/√2 for δ = λ/4; the numbers typed."""
-    vectors = responses(ideal(np.pi / 2))[0]
-    np.testing.assert_allclose(vectors[2] - vectors[3], [0, 0.5, 0.5, -0.7071067811865476], atol=1e-12)
-
-
 @pytest.mark.parametrize("delta", [np.pi, np.pi / 2, 1.1])
 def test_wave_plates_have_the_sign_of_the_papers_retarder(delta):
     """Solved waves: the same with the few 1e-3 of Fresnel losses, sin δ of the right sign."""

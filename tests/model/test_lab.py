@@ -59,14 +59,6 @@ def test_one_thickness_explains_the_table(band):
     np.testing.assert_allclose(matrix(bench(), band)[:, 1, 1], CROSS_TALK, atol=0.01)
 
 
-def test_monochromatic_light_tells_the_same():
-    """At 0.62 µm alone: the table within a point again, the thickness within 2 %."""
-    plan = builders.setting_plan(builders.monochromatic(0.62))
-    thickness = fitted(plan)
-    np.testing.assert_allclose(matrix(bench(thickness), plan)[:, 1, 1], CROSS_TALK, atol=0.01)
-    assert builders.value(bench(), "half2.plate.mgf2") == pytest.approx(thickness, rel=0.02)
-
-
 def test_retardance_falls_with_the_square_of_the_tilt(band):
     """180° − δ = 0.321° (tilt/deg)², constant to 2 % (numbers.md); δ from m32 = (1 + cos δ)/2."""
     m32 = matrix(bench(), band)[:, 1, 1]

@@ -115,12 +115,11 @@ def test_a_worker_that_is_killed_is_replaced(given, here, tmp_path):
     assert_identical(survey, here)
 
 
-def test_workers_and_scheduler_exclude_each_other(tmp_path, given):
+def test_workers_and_scheduler_exclude_each_other(tmp_path):
     """A usage error or advice, before anything is read."""
     pytest.importorskip("distributed")
-    result = run_program(
-        "stack", *given, "-o", tmp_path / "S", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"
-    )
+    words = ("-o", tmp_path / "S", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
+    result = run_program("stack", tmp_path / "none.fits", *words)
     assert result.exit_code == 2
     assert "exclude each other" in result.stderr
     assert not (tmp_path / "S").exists()

@@ -98,19 +98,6 @@ def test_nights_that_share_nothing_are_single_fits(sets, single):
     assert survey.verdict.dof == single.dof + other.dof
 
 
-@pytest.mark.long
-def test_a_step_of_what_the_model_lacks(sets, single):
-    """The planted turn, under a law of its date; 0 before; without the law the stack is not trusted."""
-    date = SMALL.start + 17.5
-    survey = stack([single, *sets[1:]], {"hwp1_axis.angle": {"per": "step", "at": date}})
-    before, after = (survey.at(date + days)["hwp1_axis.angle"] for days in (-1.0, 1.0))
-    assert (before.value, before.sigma) == (0.0, 0.0)
-    assert 0.0 < after.sigma < TURN / 10.0
-    assert abs(after.value - TURN) < 4.0 * after.sigma
-    assert survey.trusted
-    assert survey.breaks == ()
-
-
 def test_a_break_is_found_and_named(sets, single):
     """The planted turn, without a law of it: its date, its size, its name or its class; then it is a law."""
     assert not stack([single, *sets[1:]], find=False).trusted

@@ -103,10 +103,7 @@ def _sellmeier(wavelength, constant, strengths, resonances):
 def bk7(wavelength):
     """N-BK7, Schott 2017."""
     return _sellmeier(
-        wavelength,
-        1.0,
-        (1.03961212, 0.231792344, 1.01046945),
-        (0.00600069867, 0.0200179144, 103.560653),
+        wavelength, 1.0, (1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)
     )
 
 
@@ -120,16 +117,10 @@ def quartz(wavelength):
 def mgf2(wavelength):
     """Ordinary and extraordinary index of MgF2, Dodge 1984 (whose resonances are in µm, not µm²)."""
     ordinary = _sellmeier(
-        wavelength,
-        1.0,
-        (0.48755108, 0.39875031, 2.3120353),
-        (0.04338408**2, 0.09461442**2, 23.793604**2),
+        wavelength, 1.0, (0.48755108, 0.39875031, 2.3120353), (0.04338408**2, 0.09461442**2, 23.793604**2)
     )
     extraordinary = _sellmeier(
-        wavelength,
-        1.0,
-        (0.41344023, 0.50497499, 2.4904862),
-        (0.03684262**2, 0.09076162**2, 23.771995**2),
+        wavelength, 1.0, (0.41344023, 0.50497499, 2.4904862), (0.03684262**2, 0.09076162**2, 23.771995**2)
     )
     return ordinary, extraordinary
 

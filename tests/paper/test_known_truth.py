@@ -140,7 +140,6 @@ def check_pairs(errors, table, limit):
 
 
 @pytest.mark.long
-@pytest.mark.long
 def test_two_exposures_on_a_cut(south_set, south_fit):
     """As good everywhere as one exposure is expected to be where it holds q and u."""
     south = south_set("b")

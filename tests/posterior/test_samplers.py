@@ -10,12 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
-from walop_jax.posterior.draws import read_draws, with_moments
 from walop_jax.posterior.emcee import Emcee
-from walop_jax.posterior.files import Chain, write_posterior
-from walop_jax.posterior.nuts import Nuts
+from walop_jax.posterior.files import Chain
 from walop_jax.posterior.result import Options
 from walop_jax.posterior.samplers import SAMPLERS, Density, Sampler, Stretch, make_sampler
 from walop_jax.posterior.sampling import Ensembles, sample
@@ -107,45 +104,6 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
     assert cut.to_arviz().posterior.attrs["sampler"] == "metropolis"
     assert cut.chains.shape[:3] == (2, 320, 1)
     assert not (tmp_path / "chain").exists()  # chains of others than emcee are not kept
-
-
-@pytest.mark.long
-def test_nuts_samples_the_exact_posterior_of_everything(scene: Scene, tmp_path: Path):
-    """Too short to be trusted, long enough to see that all free parameters move by their standard errors."""
-    pytest.importorskip("blackjax")
-    result = scene.result
-    options = Options(sampler=Nuts(warm_up=40), seed=1, interval=50, maximum_steps=50, checks=16)
-    found = sample(result, options, folder=tmp_path / "chain")
-    assert found.accuracy is None
-    assert (found.sampler, found.sampled) == (
-        "nuts",
-        tuple(scene.surrogate.names[i] for i in scene.surrogate.sampled),
-    )
-    assert set(found.convergence.names) == set(scene.target.names)
-    assert found.counts["gradients"] >= 2 * 50
-    assert not (tmp_path / "chain" / "surrogate.h5").exists()
-    free = result.model.free
-    ratio = np.sqrt(np.diag(found.covariance))[free] / result.sigma[free]
-    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.2)
-    assert np.sqrt(np.mean(((found.mean - result.values)[free] / result.sigma[free]) ** 2)) < 0.5
-    assert np.isfinite(found.intervals()["ESS"][0]).all()
-    assert found.document()["surrogate"] is None
-    np.testing.assert_allclose(
-        found.chains[..., 0].ravel(),
-        found.draws[..., result.model.names.index(found.sampled[0])].ravel(),
-        rtol=1e-12,
-    )
-    write_posterior(
-        tmp_path / "posterior.nc", dataclasses.replace(found, convergence=_converged(found.convergence))
-    )
-    draws = read_draws(tmp_path / "posterior.nc", found.names)
-    assert draws.shape == (80, len(found.names))
-    moments = with_moments(Calibration.from_fit(result), tmp_path / "posterior.nc")
-    np.testing.assert_allclose(moments.values, draws.mean(axis=0), rtol=1e-12)
-
-
-def _converged(verdict):
-    return dataclasses.replace(verdict, reasons=())
 
 
 def test_what_is_no_sampler_is_refused_with_advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

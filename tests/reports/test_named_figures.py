@@ -53,17 +53,10 @@ def source(tmp_path_factory) -> FigureSource:
 
 
 @pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
-def test_figures_are_drawn(source, name):
-    figure = draw(name, source)
-    axes = [axis for axis in figure.axes if axis.get_title() or axis.get_xlabel()]
-    assert axes
-    assert any(axis.has_data() for axis in axes)
-
-
-@pytest.mark.parametrize("name", [name for name in FIGURES if name not in WITHOUT])
 def test_figures_in_a_column_of_print(source, name):
     """89 mm wide as in journals: type of 7 pt, nothing cut off, no titles on each other, maps with one frame."""
     figure = draw(name, dataclasses.replace(source, canvas=Canvas(width=89.0 / 25.4)))
+    assert any(axis.has_data() for axis in figure.axes if axis.get_title() or axis.get_xlabel())
     assert_fits_in_print(figure, 89.0)
     frames = {(axis.get_xlim(), axis.get_ylim()) for axis in figure.axes if axis.get_aspect() == 1.0}
     assert len(frames) <= 1

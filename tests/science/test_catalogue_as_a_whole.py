@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -12,7 +11,6 @@ from star_tables import read, stars
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.fit.verdict import Hidden, Quality, Structure
-from walop_jax.science import apply as application
 from walop_jax.science.apply import apply
 from walop_jax.science.stokes_columns import about_counts
 
@@ -145,27 +143,6 @@ def test_what_grows_with_time_along_the_field_or_with_light(vectors, calibration
     table["N"][:, 2] += 5000.0
     (change,) = apply(calibration, read(table, tmp_path)).check.changes
     assert "light" in {entry.kind for entry in change.alike}
-
-
-def test_errors_hold_the_structure_of_field_points(vectors, calibration, tmp_path, monkeypatch):
-    """Gains of 0.2 % that every star has for itself: (q, u) scatter by what the structure of the verdict adds."""
-    table, truth = stars(vectors, 600, flux=4e9)
-    table["N"] *= 1.0 + 2e-3 * np.random.default_rng(6).standard_normal(table["N"].shape)
-    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3))
-    rough = copy.copy(vectors)
-    rough.calibration = dataclasses.replace(calibration, verdict=verdict)
-    monkeypatch.setattr(application, "AnalysisVectors", lambda _: rough)
-    found = apply(rough.calibration, read(table, tmp_path))
-    good = np.isfinite(found.qu).all(axis=1) & (found.flag & Quality.HIGH_CROSSTALK == 0)
-    added = found.calibration[good] - apply_plain(vectors, calibration, table, tmp_path, monkeypatch)[good]
-    pull = (found.qu - truth)[good] / np.sqrt(np.einsum("sii->si", added))
-    assert np.sqrt(np.mean(pull**2, axis=0)) == pytest.approx([1.0, 1.0], abs=0.1)
-
-
-def apply_plain(vectors, calibration, table, tmp_path, monkeypatch):
-    """Covariance from the calibration alone, without any structure."""
-    monkeypatch.setattr(application, "AnalysisVectors", lambda _: vectors)
-    return apply(calibration, read(table, tmp_path)).calibration
 
 
 def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vectors, calibration, tmp_path):

@@ -145,17 +145,6 @@ def test_calibration_shift_is_the_derivative():
     np.testing.assert_allclose(predicted, 0.5 * moved, rtol=1e-5, atol=1e-12)
 
 
-def test_scale_and_order_do_not_matter():
-    rng = np.random.default_rng(7)
-    star = np.array([0, 0, 1, 1])
-    a = vectors(rng, 4)
-    counts, sigma = observe(a, star, np.full((2, 2), 0.02), np.full(4, 1e5), rng)
-    one = estimate(a, counts, sigma, star)
-    other = estimate(a[::-1], 7.0 * counts[::-1], 7.0 * sigma[::-1], 1 - star[::-1])
-    np.testing.assert_allclose(other.qu[::-1], one.qu, atol=1e-12)
-    np.testing.assert_allclose(other.photon[::-1], one.photon, rtol=1e-10)
-
-
 def test_arms_with_fluxes_of_their_own():
     """Whatever share of the light an arm gets, q is (N0 − N1)/(N0 + N1) and u is (N2 − N3)/(N2 + N3)."""
     pairs = Cameras(("O1", "E1", "O2", "E2"), arms=((0, 1), (2, 3)), split=True)

@@ -282,19 +282,6 @@ def test_the_new_set_is_fitted_with_the_old_model(first, monkeypatch):
     assert new.model.names == model.names
 
 
-def test_epoch_from_the_command_line(product, first, tmp_path):
-    write_calibration(tmp_path / "old.fits", product)
-    write_calibration_set(tmp_path / "new.fits", simulate(SMALL, seed=300, instrument=first[0]).calset)
-    result = CliRunner().invoke(
-        app, ["epoch", str(tmp_path / "old.fits"), str(tmp_path / "new.fits"), "--json"]
-    )
-    assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["fits"] is True
-    assert told["old"] == product.content_hash()
-    assert len(told["moved"]) > 50
-
-
 def test_another_instrument_is_refused(first):
     calset = simulate(dataclasses.replace(SMALL, instrument="WALOP-NORTH")).calset
     with pytest.raises(ValueError, match="of WALOP-NORTH, the calibration of WALOP-SOUTH"):

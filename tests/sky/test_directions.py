@@ -78,11 +78,7 @@ def test_an_angle_goes_to_the_galactic_frame_as_a_step_on_the_sky_does(angle):
 def test_names_are_cut_off_not_rounded():
     assert designations(
         np.array([97.79416016514, 359.9999999, 0.0]), np.array([-44.18037606, 0.99999, -0.5])
-    ).tolist() == [
-        "J063110.59-441049.3",
-        "J235959.99+005959.9",
-        "J000000.00-003000.0",
-    ]
+    ).tolist() == ["J063110.59-441049.3", "J235959.99+005959.9", "J000000.00-003000.0"]
 
 
 def test_a_shift_and_a_rotation_are_recovered():

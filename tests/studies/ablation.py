@@ -163,11 +163,7 @@ def _of_descriptions(real: Callable[..., Any], fired: set[str], rule: str) -> Ca
 
 
 _NAMES = list(RULES)
-WATCHED = {
-    _NAMES[1]: _when(False),
-    _NAMES[2]: _when(False),
-    _NAMES[3]: _of_descriptions,
-}
+WATCHED = {_NAMES[1]: _when(False), _NAMES[2]: _when(False), _NAMES[3]: _of_descriptions}
 
 
 def _leaders(real: Callable[..., Any], fired: set[str]) -> Callable[..., Any]:

@@ -36,19 +36,15 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+import handmade_run  # noqa: E402
 from astropy.table import Table  # noqa: E402
-from handmade_run import parameters  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 
-from walop_jax.calibration.calibration import Product  # noqa: E402
-from walop_jax.calibration.matrix import MatrixMaps  # noqa: E402
 from walop_jax.calibration.product import read_product, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
-from walop_jax.data.grid import Grid  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
 from walop_jax.fit.base_model import base_model, model_for  # noqa: E402
 from walop_jax.fit.model_file import render  # noqa: E402
-from walop_jax.fit.verdict import Verdict  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
@@ -122,33 +118,6 @@ def _read_catalogue(path: Path) -> Answer:
     return Answer(digest(read_catalogue(read_input_table(path), nominal_instrument("WALOP-SOUTH"))))
 
 
-def _product(folder: Path) -> bytes:
-    calset = read_calibration_set(Handmade(folder).write())
-    rng = np.random.default_rng(5)
-    root = 1e-3 * rng.standard_normal((3, 3))
-    grid = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((0.1, 0.0), (0.0, 0.2)))
-    three = parameters(
-        ("pupil.magnification", "", 15.63, (15.63, 0.05), True),
-        ("collimator.q", "", 0.0, (0.0, 0.0015), True),
-        ("throughput.n0.p00", "", 0.5, None, False),
-    )
-    maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
-    product = Product(
-        instrument=calset.instrument,
-        parameters=three,
-        maps=maps,
-        model_lines=("[model]", 'instrument = "WALOP-SOUTH"'),
-        values=np.array([15.63, 1.0 / 3.0, 0.5]), site=calset.site, origin="by hand", date="2026-11-21T10:00:00",
-        verdict=Verdict(3e4, 33000, 44000, 1.0, True),
-        covariance=root @ root.T,
-        field=(-0.29, 0.29, -0.3, 0.25), exposures=calset.exposures, filters=calset.filters,
-        sources=calset.sources, inputs=calset.inputs,
-        versions={"python": "3.11"},
-    )  # fmt: skip
-    write_calibration(folder / "product.fits", product)
-    return (folder / "product.fits").read_bytes()
-
-
 def _catalogue(folder: Path, suffix: str, form: str) -> bytes:
     count = np.array([[1e5 + 1000 * n + 10 * k for k in range(4)] for n in range(6)])
     columns: dict[str, Any] = {
@@ -168,6 +137,7 @@ def subjects(folder: Path) -> list[Subject]:
     sound = Handmade(folder).write("sound.fits")
     calset = read_calibration_set(sound)
     text = render(base_model(calset, throughput_degree=1))
+    write_calibration(folder / "product.fits", handmade_run.product())
 
     def read_model(path: Path) -> Answer:
         model = model_for(calset, path.read_text(encoding="utf-8"))
@@ -177,7 +147,7 @@ def subjects(folder: Path) -> list[Subject]:
     return [
         Subject("set with checksums", sound.read_bytes(), ".fits", _read_set),
         Subject("set without", Handmade(folder).write(checksum=False).read_bytes(), ".fits", _read_set),
-        Subject("product", _product(folder), ".fits", _read_product),
+        Subject("product", (folder / "product.fits").read_bytes(), ".fits", _read_product),
         *(Subject(f"catalogue {s}", _catalogue(folder, s, f), s, _read_catalogue) for s, f in forms.items()),
         Subject("model file", text.encode(), ".toml", read_model),
     ]

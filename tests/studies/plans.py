@@ -348,9 +348,7 @@ class Most:
                 tried.add(given_up)
                 kept = np.array([i for i in range(len(z)) if i not in given_up])
                 some = dataclasses.replace(
-                    self.problem,
-                    targets=self.problem.targets[:, kept],
-                    budget=min(best, self.problem.budget),
+                    self.problem, targets=self.problem.targets[:, kept], budget=min(best, self.problem.budget)
                 )
                 plan, _ = least_budget(some, self.goal)
                 best = min(best, cost_of(some, plan) * plan.value / self.goal)

@@ -53,7 +53,7 @@ ERRORS = (
             "data/test_bad_input_table.py"),
     planted("data/table_intensities.py", "_SPOILT = 0.2", "_SPOILT = 0.5", "data/test_bad_input_table.py"),
     planted("data/table_intensities.py", "counts >= -NEGATIVE * sigma", "counts >= NEGATIVE * sigma",
-            "data/test_reading.py"),
+            "data/test_bad_input_table.py"),
     planted("data/inspection.py", "sigma**2 / np.where(counts > 0, counts, 1.0)",
             "sigma / np.where(counts > 0, counts, 1.0)", "commands/test_commands.py"),
     # sky

@@ -422,11 +422,7 @@ def stability(bench: Bench) -> Callable[[int], Answer]:
         votes = np.zeros((len(groups.halves), len(chosen)), bool)
         for k, rows in enumerate(groups.halves):
             *_, b = path(
-                grams[k][block],
-                groups.x[np.ix_(rows, at)].T @ r[rows],
-                0.5 * lambdas,
-                None,
-                QUICKEST,
+                grams[k][block], groups.x[np.ix_(rows, at)].T @ r[rows], 0.5 * lambdas, None, QUICKEST
             )
             votes[k] = np.add.reduceat(b**2, path.ptr[:-1]) > 0
         kept, alike = [], groups.alike[np.ix_(chosen, chosen)]

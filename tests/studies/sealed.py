@@ -184,18 +184,7 @@ def draw(rng: np.random.Generator, calset: CalibrationSet) -> Hidden:
     ):
         made[np.diag_indices(4)] = 0.0  # a depolariser with the other sign would polarise
     text = f"{where}, {field_name}, {law_name}, {size:.1e}"
-    return Hidden(
-        text,
-        where,
-        size,
-        made,
-        field,
-        colour,
-        values,
-        star,
-        cameras,
-        rng.uniform(0.3, 2.0),
-    )
+    return Hidden(text, where, size, made, field, colour, values, star, cameras, rng.uniform(0.3, 2.0))
 
 
 # --------------------------------------------------------------------------------------------------------------- a set

@@ -202,11 +202,7 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         "errors too large": plain(lambda c: with_block(c, sigma=100.0 * block(c).sigma)),
         "errors too small": plain(lambda c: with_block(c, sigma=0.01 * block(c).sigma)),
         "errors of one camera": plain(errors_of_one),
-        "lamp of another temperature": columns(
-            teff=lambda c: np.where(
-                c.exposures.kind == "clp", c.exposures.teff * (1.0 - 0.3 * min(size, 2.0)), c.exposures.teff
-            )
-        ),
+        "lamp of another temperature": columns(teff=lamp),
         "cameras exchanged": plain(
             lambda c: with_block(
                 c, counts=block(c).counts[..., [2, 3, 0, 1]], sigma=block(c).sigma[..., [2, 3, 0, 1]]

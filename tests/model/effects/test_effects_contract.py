@@ -86,14 +86,6 @@ def test_parameters_units_and_sources(kind: EffectKind):
 
 
 @every_effect
-def test_its_page_says_what_it_is(kind: EffectKind):
-    text = kind.head()
-    for section in ("Equation", "Source", "Neutral", "Revealed by"):
-        assert section in text, section
-    assert kind.__doc__
-
-
-@every_effect
 def test_names_in_class_variables_are_parameters(kind: EffectKind):
     names = set(kind.numbers())
     assert {*kind.shape, *kind.one_sided} <= names

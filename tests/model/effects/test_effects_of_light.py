@@ -122,8 +122,7 @@ def test_moon_patch_is_of_its_exposure():
     found = (
         stokes(
             dataclasses.replace(
-                make("moon_patch").replaced(q=jnp.array([0.003]), u=jnp.array([-0.004])),
-                moon=((1, 7),),
+                make("moon_patch").replaced(q=jnp.array([0.003]), u=jnp.array([-0.004])), moon=((1, 7),)
             )
         )
         - stokes()

@@ -81,11 +81,7 @@ class Layout:
         fitted, whole = measured_set(seed)
         self.columns: dict[str, np.ndarray] = {}  # of effects and sentences in all rows, by candidate
 
-        def examined(
-            result: FitResult,
-            hypotheses: Hypotheses,
-            rng: np.random.Generator,
-        ) -> Examination:
+        def examined(result: FitResult, hypotheses: Hypotheses, rng: np.random.Generator) -> Examination:
             """With the columns of all exposures that were taken: the one before may be kept back."""
             columns = Columns(Likelihood.of(whole, result.model), result.values)
             asked = all_candidates(columns, [*hypotheses.names, *hypotheses.sentences])
