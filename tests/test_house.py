@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2205,
     "science": 6110,
-    "diagnosis": 7600,
+    "diagnosis": 7850,
     "nights": 2810,
     "plans": 2305,
     "paper": 810,

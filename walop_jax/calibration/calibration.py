@@ -298,7 +298,8 @@ class Calibration(Contents, Fitted):
             "χ²/dof": f"{v.chi2:.1f} / {v.dof} = {v.chi2 / max(v.dof, 1):.4g}",
             "field": f"X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
             "filters": ", ".join(sorted({str(name) for name in self.exposures.filter})),
-            "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
+            "effects": ", ".join(name for name in self.model.effect_names if name != Deviations.name)
+            or "none beyond the base model",
             "errors from": f"covariance of the {v.covariance_from}, {v.errors_from}",
         }
         notes = (*parameter_notes(self.model, self.sigma), *v.warnings)

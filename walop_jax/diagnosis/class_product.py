@@ -110,7 +110,7 @@ class Classes(NamedTuple):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """What is in the product as `Deviations`."""
+        """Those that are in the product as `Deviations`."""
         return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
 
     def deviations(self, context: Context) -> Deviations | None:
