@@ -56,7 +56,9 @@ def starting(result: FitResult, text: str) -> Calibration:
     return Calibration.from_fit(unfitted)
 
 
-def test_the_fit_is_trusted(result, calibration):
+def test_errors_and_trust_are_those_of_the_fit(result, calibration):
+    np.testing.assert_array_equal(np.diag(calibration.covariance), np.diag(result.covariance))
+    np.testing.assert_array_equal(calibration.covariance, calibration.covariance.T)
     assert result.trusted
     assert calibration.verdict.trusted
     assert calibration.verdict.quality == 0

@@ -150,7 +150,8 @@ ERRORS = (
     # science
     planted("science/estimate.py", "np.where(used, sigma, 1.0) ** 2", "np.where(used, sigma, 1.0)",
             "science/test_estimate.py"),
-    planted("science/estimate.py", "- rows_used, first) - 2", "- rows_used, first)", "science/test_estimate.py"),
+    planted("science/estimate.py", "- used.any(axis=1), first) - 2", "- used.any(axis=1), first)",
+            "science/test_estimate.py"),
     planted("science/estimate.py", "return -np.add.reduceat(gain @ change, first)",
             "return np.add.reduceat(gain @ change, first)", "science/test_estimate.py"),
     planted("science/polarisation.py", "sin**2 * qq - 2.0 * cos * sin * qu_", "sin**2 * qq + 2.0 * cos * sin * qu_",
