@@ -249,7 +249,7 @@ def sealed(number: int, seed: int, side: int) -> Sealed:
     )
     measured = dataclasses.replace(table, counts=counted[numbers], sigma=sigma[numbers])
     calset = dataclasses.replace(calset, intensities=measured, origin="sealed")
-    text = what if one is None else one.text
+    text, taken = what if one is None else one.text, calset
     if what == "tables":
         text, calset = mistaken(rng, calset)
     x, y = rng.uniform(-0.25, 0.25, (2, PLACES))
@@ -257,7 +257,7 @@ def sealed(number: int, seed: int, side: int) -> Sealed:
     flux = np.sum(m * counted / sigma, axis=1) / np.sum(m * m, axis=1)
     chi2 = float(np.sum(((counted - flux[:, None] * expected) / sigma) ** 2))
     homes = homes_of(text, "") if one is None else homes_of(one.where, text.split(", ")[2])
-    return Sealed(calset, text, x, y, truth(params, calset, x, y, one), chi2, frozenset(homes))
+    return Sealed(calset, text, x, y, truth(params, taken, x, y, one), chi2, frozenset(homes))
 
 
 def counts(
