@@ -1,13 +1,8 @@
-"""Hold the oracle against sets with known truth: `python -m oracle.validate [FOLDER [SET]]` in tests/."""
+"""The oracle against sets with known truth."""
 
 from __future__ import annotations
 
-import sys
-import time
-from pathlib import Path
-
 import numpy as np
-from south_sets import CUTS, SouthSet
 
 from . import forward
 
@@ -76,33 +71,3 @@ def compare(params, table, wavelengths, weights):
         for k, value in truth_matrix(table, suffix).items():
             out[k + suffix] = model[k] - value
     return out
-
-
-def main(folder=CUTS, name="a"):
-    """Print the comparison with the truth, then the fit and its calibration error."""
-    from . import fit
-
-    south = SouthSet.of(Path(folder), name)
-    params, table = read_truth(south)
-    data = forward.load(south.path)
-    band = forward.band(*data["filters"]["SDSS-r"], 5772.0)
-    for k, error in compare(params, table, *band).items():
-        print(f"{k:8s} rms {np.sqrt(np.mean(error**2)):.1e}  max {np.max(np.abs(error)):.1e}")
-    truth = truth_matrix(table)
-    good = np.abs(truth["m22"] * truth["m33"] - truth["m23"] * truth["m32"]) >= 0.1
-    for log in (False, True):
-        start = time.perf_counter()
-        found = fit.fit(data, log=log)
-        seconds = time.perf_counter() - start
-        matrix = forward.matrix(found["params"], table["X"], table["Y"], *band, log=log)
-        errors = fit.recovery_error(matrix, truth)
-        rms = [100 * np.sqrt(np.mean(e[good] ** 2)) for e in errors]
-        print(
-            f"{'log throughput' if log else 'throughput'} a polynomial: "
-            f"chi2 {found['chi2']:.2f} dof {found['dof']} in {seconds:.1f} s; "
-            f"error q {rms[0]:.4f} % u {rms[1]:.4f} % at {good.sum()} of {good.size} points"
-        )
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -18,7 +18,10 @@ from unittest.mock import patch
 import jax
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies", "studies/benchmark"))]
+sys.path[:0] = [
+    str(ROOT),
+    *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies", "studies/benchmark")),
+]
 
 from ablation import WORTH, Scenes  # noqa: E402
 
@@ -38,7 +41,8 @@ def changed(scenes: Scenes, name: str, factor: float) -> tuple[int, int, int]:
     """Scenes with another answer, better and worse ones with the number as it is."""
     value = getattr(thresholds, name)
     counts = [0, 0, 0]
-    with patch.object(thresholds, name, type(value)(max(value * factor, 1)) if isinstance(value, int) else value * factor):
+    replaced = type(value)(max(value * factor, 1)) if isinstance(value, int) else value * factor
+    with patch.object(thresholds, name, replaced):
         for number, before in scenes.as_they_are.items():
             now = scenes.judged(number)
             gain = WORTH[before["outcome"]] - WORTH[now["outcome"]]
