@@ -202,9 +202,10 @@ class _AtData(InExposures):
 
 
 class _Block(NamedTuple):
-    """Undetected changes at one place: amplitudes, their responses, and the groups that are hypotheses by themselves.
+    """Undetected changes at one place: their amplitudes, and the groups that are hypotheses by themselves.
 
-    `along` and `slopes` are the projection on the free parameters and their change, by each amplitude.
+    `gram` and `scores` are products of their columns, projected off the free parameters, with each other and with the
+    residuals; `slopes` is the change of the free parameters by each.
     """
 
     sums: tuple[Sum, ...]
@@ -216,7 +217,7 @@ class _Block(NamedTuple):
 
 
 def undetected(laid: Laid) -> Shape | None:
-    """Covariance of a change that the data would not show, in terms of changes ahead of the train; None of none."""
+    """Covariance of changes that the data would not show, as one of changes ahead of the train; None without any."""
     if not (places := _steady_places(laid)):
         return None
     step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
@@ -266,7 +267,7 @@ def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) 
     changes, degrees = list[Sentence](), list[tuple[str, int]]()
     for (pattern, degree), kind in itertools.product(zip(CUBIC, DEGREES, strict=True), GENERATORS):
         change = Sentence(kind, where, place, pattern)
-        if (over_field or not degree) and laid.columns.has(((1.0, change),)):
+        if (over_field or not degree) and laid.columns.has(((1.0, change),)) and data.rms(change) > 0.0:
             changes.append(change)
             degrees.append((kind.partition(" ")[0], degree))
     if not changes:
@@ -296,7 +297,7 @@ def _is_seen(block: _Block) -> bool:
 
 def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
     """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
-    prior, moments = EXPECTED / sum(len(block.groups) for block in blocks), []
+    prior, moments = EXPECTED / max(sum(len(block.groups) for block in blocks), 2), []
     for block in blocks:
         moment = np.zeros_like(block.gram)
         for group in map(list, block.groups):
