@@ -227,3 +227,21 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     alone = classes._replace(additions=(), undetected=None)
     product = averaged(Calibration.from_fit(state.result.judged()), alone, context)
     assert "deviations" not in product.model.effect_names
+
+
+def test_deviations_of_sky_light_may_depend_on_the_temperature():
+    """No element ahead of the polariser may: they are changes of the light, at 0 K from the reference none."""
+    text = "diattenuation q ahead of polariser * kelvin"
+    calset = simulate(SMALL, seed=3).calset
+    kelvin = 10.0 + np.linspace(-2.0, 2.0, len(calset.exposures))
+    calset = dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, temp=kelvin))
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
+    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
+    classes = ambiguities(state, context, {Described.name}, [text])
+    laws = {change.beside_field for ((_, change),) in classes.shape.deviations.sums}
+    assert ("kelvin",) in laws
+    product = averaged(Calibration.from_fit(state.result.judged()), classes, context)
+    (matrix, covariance), alone = product.matrix(0.1, 0.1), Calibration.from_fit(state.result.judged())
+    assert np.all(np.isfinite(matrix))
+    assert np.all(np.diag(covariance) >= np.diag(alone.matrix(0.1, 0.1)[1]))

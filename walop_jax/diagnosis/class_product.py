@@ -113,16 +113,20 @@ class Classes(NamedTuple):
         """Those that are in the product as `Deviations`."""
         return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
 
-    def deviations(self, context: Context) -> Deviations | None:
+    def deviations(self, model: Model, context: Context) -> Deviations | None:
         """The effect that includes all that acts on stars, zero; None if nothing does."""
         changes = [shape.deviations.sums[j][0][1] for shape in self.shapes for j in shape.on_stars]
         described = (
             [] if self.shape is None else [self.shape.deviations.sums[j][0][1] for j in self.shape.on_stars]
         )
-        places = dict.fromkeys(_place(change) for change in described if change.kind in GENERATORS)
-        others = [
-            change.text for change in changes if change.kind not in GENERATORS or _place(change) not in places
-        ]
+        polariser = model.template.polariser
+        # Ahead of the polariser no element may depend on exposures; its light may.
+        ahead = None if polariser is None else ("ahead of", polariser.name)
+        optical = (change for change in described if change.kind in GENERATORS)
+        places = dict.fromkeys(
+            _place(c) for c in optical if not c.beside_field or (c.where, c.place) != ahead
+        )
+        others = [c.text for c in changes if c.kind not in GENERATORS or _place(c) not in places]
         return Deviations.of(context, places=places, sentences=others) if changes else None
 
 
@@ -211,7 +215,7 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
         for _, sentence in amplitude
     )
     model = calibration.model
-    if (effect := classes.deviations(context)) is not None:
+    if (effect := classes.deviations(model, context)) is not None:
         model = with_effects(model, [effect], context)
     if not texts:
         return model
