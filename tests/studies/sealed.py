@@ -24,7 +24,8 @@ where the truth is Δχ² = 30 better than the base model.
 
 All stars share the error of one calibration, so that even an exact covariance puts many of them beyond three errors now
 and then (`chance.py`). Beside the number of products that are trusted and wrong stands therefore the number that their
-own covariances would give by chance.
+own covariances would give by chance. With `--refit-only` nothing is searched for: "diagnosis" stands then for trusted
+fits with the errors of undetected changes.
 
 A name or a description is right if it places the cause where it was hidden (`home`): ahead of the polariser, in it,
 in the common train, in one half, in the cameras, in a source, in the tables. `class`: another one that the diagnosis
@@ -57,10 +58,15 @@ from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
+from walop_jax.diagnosis.class_product import with_average  # noqa: E402
+from walop_jax.diagnosis.discrepancy import ambiguities  # noqa: E402
+from walop_jax.diagnosis.examination import examine  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Hypotheses  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
-from walop_jax.fit.refit import refit  # noqa: E402
+from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
+from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -410,7 +416,8 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
     held = fitted.expansion.data - one.chi2 + len(fitted.model.free)
     before = judged(Calibration.from_fit(fitted), bool(fitted.trusted), one) if fitted.converged else None
     if options.refit_only:
-        return Outcome(one.text, held, before, None, "", np.nan, False, time.process_time() - began)
+        after = judged(_with_undetected(fitted), True, one) if fitted.trusted else None
+        return Outcome(one.text, held, before, after, "", np.nan, False, time.process_time() - began)
     try:
         found = diagnose(one.calset, seed=number, minutes=options.minutes)
     except (DataError, ValueError) as error:
@@ -442,6 +449,13 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
         time.process_time() - began,
         right_of(one, found),
     )
+
+
+def _with_undetected(fitted: FitResult) -> Calibration:
+    """The calibration of a diagnosis that adds nothing to a fit."""
+    context = effect_context(fitted.model.template, fitted.calset.exposures)
+    state = examine(fitted, Hypotheses(), np.random.default_rng(0))
+    return Calibration.from_fit(with_average(fitted, ambiguities(state, context, set(), [])))
 
 
 def line(number: int, one: Outcome) -> str:
