@@ -1,4 +1,4 @@
-"""Model discrepancy in the product of a diagnosis: what descriptions leave open, and what the data would not show.
+"""Model discrepancy in the product of a diagnosis: deviations from descriptions, and undetected changes.
 
 Shape        A description without a name is the simplest one that explains the data: a polynomial over the field, one
              law over the exposures, one kind of polarisation. Its cause has no reason to be so simple. Deviations from
@@ -15,8 +15,8 @@ Undetected   Elements that the model does not let vary have errors of 10⁻⁶, 
              n groups g is there or not, with a probability π = 1/n beforehand: one change is expected. By the
              evidence B_g of one linear step,
                  E[δδᵀ] = Σ_g p_g (C_g + c_g c_gᵀ),   p_g = π B_g / (1 − π + π B_g)
-             is added to the covariance; values stay those of the fit. What data limit adds nothing, what they leave
-             open adds its prior, what they suggest without an alarm adds its size.
+             is added to the covariance; values stay those of the fit. Changes that data exclude add nothing, those
+             without any trace in them their prior, those suggested without an alarm their size.
 Starlight    Any such change acts on a star, to first order, as one ahead of the train does: few of these, chosen one
              after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
