@@ -52,7 +52,7 @@ def test_second_moments_are_those_of_the_mixture():
         np.array([500.0, -20.0]),
         np.array([0.02, 0.003]),
     )
-    block = _Block((), widths, ((0,), (1,)), gram, score, np.zeros((0, 2)))
+    block = _Block((), widths, ([0], [1]), gram, score, np.zeros((0, 2)))
     (moments,) = _second_moments([block], 1.0)
     evidence, squares = [], []
     for i in range(2):

@@ -18,6 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.calibration.accuracy import Matrices
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
@@ -39,7 +40,6 @@ from walop_jax.model.specification import Model, series_indices
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
-Matrices = Float[np.ndarray, "p a 3"]  # point, arm, element
 Slopes = Float[np.ndarray, "p a 3 n"]  # in all parameters
 Filters = Mapping[str, FilterCurve]
 _MARK = 2.0**40

@@ -189,7 +189,8 @@ class LinearStep:
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
         self.rest = np.delete(np.arange(design.jacobian.shape[1]), at)
-        self.projector = Projector(design.jacobian[:, self.rest], design.eliminated)
+        others = design.jacobian[:, self.rest]
+        self.projector = Projector(others, design.eliminated) if len(at) else design.projector
         self.left = self.projector(design.residual + self.lost)
 
     def addition(self, name: str, sums: tuple[Sum, ...]) -> Likeness:

@@ -210,7 +210,7 @@ class _Block(NamedTuple):
 
     sums: tuple[Sum, ...]
     widths: Vector
-    groups: tuple[tuple[int, ...], ...]
+    groups: tuple[list[int], ...]
     gram: Matrix
     scores: Vector
     slopes: Matrix
@@ -223,7 +223,8 @@ def undetected(laid: Laid) -> Shape | None:
     step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
     data, front = _AtData.of(laid.columns), places[0]
     blocks = {place: block for place in places if (block := _block(laid, step, data, *place)) is not None}
-    tried = [block for place, block in blocks.items() if place != front or _is_seen(block)]
+    # Without light from the sky nothing ahead of the polariser is in the data.
+    tried = [block for place, block in blocks.items() if place != front or block.gram.any()]
     if not tried or front not in blocks:
         return None
     moments = _second_moments(tried, laid.state.floor)
@@ -272,7 +273,7 @@ def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) 
             degrees.append((kind.partition(" ")[0], degree))
     if not changes:
         return None
-    groups = {key: tuple(i for i, of in enumerate(degrees) if of == key) for key in dict.fromkeys(degrees)}
+    groups = {key: [i for i, of in enumerate(degrees) if of == key] for key in dict.fromkeys(degrees)}
     patterns = {key: len({changes[i].factors for i in group}) for key, group in groups.items()}
     widths = np.array(
         [
@@ -290,17 +291,12 @@ def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) 
     )  # fmt: skip
 
 
-def _is_seen(block: _Block) -> bool:
-    """True if anything of a place is in the data."""
-    return bool(np.any(np.diag(block.gram) > 0.0))
-
-
 def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
     """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
     prior, moments = EXPECTED / max(sum(len(block.groups) for block in blocks), 2), []
     for block in blocks:
         moment = np.zeros_like(block.gram)
-        for group in map(list, block.groups):
+        for group in block.groups:
             widths = block.widths[group]
             value, vector = np.linalg.eigh(block.gram[np.ix_(group, group)] * np.outer(widths, widths))
             value, along = np.clip(value, 0.0, None), vector.T @ (block.scores[group] * widths)
