@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2650,
     "posterior": 2180,
     "science": 5809,
-    "diagnosis": 7829,
+    "diagnosis": 7820,
     "nights": 2682,
     "plans": 2224,
     "paper": 775,

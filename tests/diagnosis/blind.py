@@ -7,7 +7,7 @@ its judge by linear steps in the place of the one that fits.
 Verdicts are written before the truths are opened. In some scenes the effect that is hidden is taken out of the
 catalogue: then the sentences that it is are asked for (`EFFECTS`, `in_sentences`), and no other name.
 
-    PYTHONPATH=tests python tests/diagnosis/blind.py [scenes per effect and ratio] [OUT.json]
+    PYTHONPATH=tests python tests/diagnosis/blind.py [scenes per effect and ratio] [OUT.json] [processes]
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ import collections
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from linear_judge import Linear, joined
@@ -48,7 +51,8 @@ SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
-KEPT = 150  # spaces
+KEPT = 20  # spaces of scenes alike; each takes some 40 MB
+TOGETHER = 20  # scenes
 WITHOUT_ENTRY = 6  # scenes of one kind and ratio
 
 
@@ -298,7 +302,7 @@ class Blind:
 
     # --------------------------------------------------------------------------------------------------- judging
 
-    @functools.cache  # noqa: B019
+    @functools.lru_cache(2)  # noqa: B019
     def _asked(self, removed: tuple[str, ...]) -> Evidence:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
@@ -383,8 +387,35 @@ class Cached(Linear):
         return dataclasses.replace(state, evidence=after, steps=steps)
 
 
+def verdicts(blind: Blind, scenes: Sequence[Scene], processes: int = 1) -> list[Verdict]:
+    """What the search finds in every scene; those alike are judged together, since they share spaces."""
+    blind.judge(blind.null())  # trials of the whole catalogue are drawn once
+    order = sorted(range(len(scenes)), key=lambda i: (scenes[i].removed, scenes[i].kind, scenes[i].truth))
+    parts = [order[i : i + TOGETHER] for i in range(0, len(order), TOGETHER)]
+    if processes == 1:
+        judged = [[blind.judge(scenes[i]) for i in part] for part in parts]
+    else:
+        with multiprocessing.get_context("fork").Pool(
+            processes, _worker.update, ({"blind": blind, "scenes": scenes},)
+        ) as pool:
+            judged = pool.map(_part, parts, chunksize=1)
+    at = dict(zip(itertools.chain(*parts), itertools.chain(*judged), strict=True))
+    return [at[i] for i in range(len(scenes))]
+
+
+_worker: dict[str, Any] = {}
+
+
+def _part(part: Sequence[int]) -> list[Verdict]:
+    return [_worker["blind"].judge(_worker["scenes"][i]) for i in part]
+
+
 def study(
-    blind: Blind, each: int, ratios: Sequence[float] = (6.0, 10.0, 30.0), nulls: int = 200
+    blind: Blind,
+    each: int,
+    ratios: Sequence[float] = (6.0, 10.0, 30.0),
+    nulls: int = 200,
+    processes: int = 1,
 ) -> dict[str, object]:
     """Draw scenes, judge them, then open the truths: the numbers of the acceptance list.
 
@@ -406,11 +437,11 @@ def study(
             scenes += [blind.strange(shape, ratio) for _ in range(without_entry)]
     order = blind.rng.permutation(len(scenes))
     sealed = _seal([scenes[i] for i in order])
-    verdicts = [blind.judge(scenes[i]) for i in order]
     opened = [scenes[i] for i in order]
+    judged = verdicts(blind, opened, processes)
     if _seal(opened) != sealed:
         raise RuntimeError("the truths changed while the verdicts were made")
-    return summarise(list(zip(opened, verdicts, strict=True)), blind.in_sentences)
+    return summarise(list(zip(opened, judged, strict=True)), blind.in_sentences)
 
 
 def _seal(scenes: Sequence[Scene]) -> bytes:
@@ -512,20 +543,23 @@ def summarise(judged: Sequence[tuple[Scene, Verdict]], known: dict[str, set[str]
     }
 
 
-def main(each: int, output: Path | None) -> None:
+def main(each: int = 10, output: str = "", processes: int = 1) -> None:
     """Run the study on a simulated set and print its numbers."""
     from walop_jax.simulation.observing_plan import ObservingPlan
     from walop_jax.simulation.simulate import simulate
 
     simulated, _ = simulate(ObservingPlan(), seed=20260)
-    text = json.dumps(study(Blind(simulated), each, nulls=1000), indent=1, ensure_ascii=False)
+    text = json.dumps(
+        study(Blind(simulated), each, nulls=1000, processes=processes), indent=1, ensure_ascii=False
+    )
     print(text)
-    if output is not None:
-        output.write_text(text, encoding="utf-8")
+    if output:
+        Path(output).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10, Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    arguments = sys.argv[1:]
+    main(*(int(a) if a.isdecimal() else a for a in arguments))

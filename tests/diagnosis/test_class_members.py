@@ -109,6 +109,29 @@ def test_what_was_added_is_in_its_class_once():
     assert [member.name for member in found.members] == [own, other]
 
 
+def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
+    """A diattenuation along the analyser is a gain: as a leak of 0.1 % it would have to be 20 times that, and more.
+
+    (1 + η d, η + d): the efficiency seems to change by d (1 − η²), and first order ends long before such a d.
+    """
+    leak = "light of E1 in O1"
+    rival = "diattenuation q behind half1.plate; diattenuation u behind half1.plate"
+    calset = simulate(SMALL, seed=4, effects=[Described.saying([leak], [1e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([leak], [1e-3])], context)
+    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
+    said = [probe for probe in asked if probe.name in (leak, rival)]
+    assert len(said) == 2
+    result = fit(Likelihood.of(calset, model))
+    state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
+    classes = ambiguities(state, context, {Described.name}, [leak], alike=[rival])
+    assert [m.name for added in classes.additions for m in added.members] == []
+    alone = Calibration.from_fit(result.judged())
+    product = averaged(alone, classes, context)
+    here = [c.matrix(calset.points.x, calset.points.y)[0] for c in (alone, product)]
+    np.testing.assert_allclose(here[1], here[0], atol=1e-4)
+
+
 def test_the_product_is_read_as_it_was_written(told, tmp_path):
     from walop_jax.calibration.product import write_calibration
 

@@ -1,6 +1,7 @@
 """Physics that the search has never seen: is what a diagnosis hands on right, star by star and element by element?
 
     python tests/studies/sealed.py [--sets 400] [--first 0] [--seed 53] [--side 8] [--budget MINUTES] [--refit-only]
+    python tests/studies/sealed.py --join FILE...
 
 What is hidden in a set depends on its number and the seed alone, and is drawn from a grammar of its own. It shares no
 line with the sentences of a diagnosis (kinds, places and factors are other ones), and its light path is that of
@@ -25,7 +26,8 @@ where the truth is Δχ² = 30 better than the base model.
 All stars share the error of one calibration, so that even an exact covariance puts many of them beyond three errors now
 and then (`chance.py`). Beside the number of products that are trusted and wrong stands therefore the number that their
 own covariances would give by chance. With `--refit-only` nothing is searched for: "diagnosis" stands then for trusted
-fits with the errors of undetected changes.
+fits with the errors of undetected changes. Outcomes of some of the sets go to a file (`--save`), and several such files
+into one table (`--join`).
 
 A name or a description is right if it places the cause where it was hidden (`home`): ahead of the polariser, in it,
 in the common train, in one half, in the cameras, in a source, in the tables. `class`: another one that the diagnosis
@@ -36,6 +38,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import pickle
 import sys
 import tempfile
 import time
@@ -566,8 +569,12 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
-    parser.add_argument("--table", type=Path, help="file of the table so far, written after every set")
+    parser.add_argument("--save", type=Path, help="file of the outcomes so far, written after every set")
+    parser.add_argument("--join", type=Path, nargs="+", help="files of outcomes: print their table")
     options = parser.parse_args()
+    if options.join:
+        print(table([one for file in options.join for one in pickle.loads(file.read_bytes())]))
+        return 0
     jax.config.update("jax_enable_x64", True)
     outcomes, end = [], time.monotonic() + 60.0 * options.budget
     for number in range(options.first, options.first + options.sets):
@@ -575,8 +582,8 @@ def main() -> int:
             break
         outcomes.append(outcome(number, options))
         print(line(number, outcomes[-1]), flush=True)
-        if options.table:
-            options.table.write_text(table(outcomes) + "\n", encoding="utf-8")
+        if options.save:
+            options.save.write_bytes(pickle.dumps(outcomes))
         jax.clear_caches()  # the programs of every set are others
     print(table(outcomes))
     return 0

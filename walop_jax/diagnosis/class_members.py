@@ -31,11 +31,11 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
-from walop_jax.diagnosis.exact import signature
+from walop_jax.diagnosis.exact import beyond_prior, signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Context, Described
@@ -100,7 +100,7 @@ class Laid:
     """An examination laid out for one linear step from model to model.
 
     `alike` are effects and groups reported as indistinguishable from additions: with large residuals, where one linear
-    step is inaccurate, they count as probable.
+    step is inaccurate, they count as probable, if their amplitudes are: at most `largest` prior widths.
     """
 
     def __init__(self, state: Examination, alike: Collection[str]) -> None:
@@ -111,6 +111,8 @@ class Laid:
         self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
         self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
+        far = (beyond_prior(self.fit, name).values() for name in model.effect_names)
+        self.largest = PRIOR_EDGE * max(itertools.chain((1.0,), *far))
         self._vectors: Float[np.ndarray, "p k 3"] | None = None
         instrument = model.instrument(self.fit.values)
         setting = first_setting(calset, instrument, self.usual)
@@ -221,7 +223,9 @@ class LinearStep:
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
             if {probe.name, probe.effect.name} & set(self.laid.alike):
-                evidence = max(evidence, of_addition)
+                square = gram[at, at] + np.diag(probe.widths**-2.0)
+                if np.abs(np.linalg.solve(square, scores[at]) / probe.widths).max() <= self.laid.largest:
+                    evidence = max(evidence, of_addition)
             scored.append((evidence, probe))
         scored.sort(key=lambda item: -item[0])
         least = max(of_addition, scored[0][0] if scored else of_addition) - thresholds.IMPROBABLE

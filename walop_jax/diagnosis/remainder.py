@@ -31,11 +31,13 @@ Remainder = tuple[State, Unexplained | None]
 def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
-    A model that predicts exposures worse than the first one is not adopted. More descriptions than
-    `thresholds.MOST_SENTENCES` count as a single cause that none of them describes: they become the remainder.
+    A model that predicts exposures worse than the first one is not adopted, a free-form term included. More
+    descriptions than `thresholds.MOST_SENTENCES` count as a single cause that none of them describes: they become the
+    remainder.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
-    if state.steps and (worse := _worse(first.evidence, state.evidence)):
+    adopted = state.steps or (remainder is not None and remainder.free_form)
+    if adopted and (worse := _worse(first.evidence, state.evidence)):
         return _not_adopted(first, state, worse)
     added = tuple(name for step in state.steps for name in step.groups)  # groups of sentences
     if remainder is not None:
@@ -203,9 +205,8 @@ def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     """The first model again: the additions are reported as parts."""
     changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
     partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
-    text = (
-        f"with what was found the model predicts worse {worse}, so nothing was adopted: {'; '.join(partial)}"
-    )
+    added = "; ".join(partial) or "a free-form term"
+    text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {added}"
     remainder = _and(_unexplained(first.evidence, tuple(first.evidence.beside_patterns[0])), text)
     remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder

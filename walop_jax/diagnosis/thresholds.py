@@ -55,9 +55,7 @@ MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
 # Reports
 
 NEGLIGIBLE = 1e-4  # change of calibrated q and u that does not matter for an instrument good to 10⁻³
-LARGEST_ROBUST_RATIO = (
-    1.5  # of errors that allow for common disturbances of an exposure, to those that do not
-)
+LARGEST_ROBUST_RATIO = 1.5  # of errors that allow for common disturbances of an exposure to those that do not
 SHOWN = 4  # alternatives that a sentence lists; files have all
 ROUNDING = 1e-9  # share below which a number is rounding
 LIMIT = 0.95  # probability with which an effect that was not found stays below its limit
@@ -73,21 +71,12 @@ READING_SURE = 1.2  # χ²/dof up to which another reading explains the data, be
 # Candidates and time
 
 MOST_FITS = 40  # exact fits of additions in one diagnosis, after which nothing further is tried
-MOST_FITS_FAR_OFF = (
-    12  # the same where the model is so far off that errors were scaled (`fit.search.FAR_OFF`)
-)
-RINGS = (
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-)  # degrees of patterns of rings about the centre; the throughput absorbs smoother ones
-ASKED_BY_CAMERA = (
-    "pedestal",
-    "nonlinearity",
-)  # effects that are asked camera by camera, under their names there
+# The same where the model is so far off that errors were scaled (`fit.search.FAR_OFF`).
+MOST_FITS_FAR_OFF = 12
+# Degrees of patterns of rings about the centre; the throughput absorbs smoother ones.
+RINGS = (3, 4, 5, 6, 7, 8)
+# Effects that are asked camera by camera, under their names there.
+ASKED_BY_CAMERA = ("pedestal", "nonlinearity")
 
 
 def in_use() -> dict[str, float]:
