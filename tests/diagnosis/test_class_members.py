@@ -22,6 +22,7 @@ from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
+from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import simulate
@@ -130,6 +131,29 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     product = averaged(alone, classes, context)
     here = [c.matrix(calset.points.x, calset.points.y)[0] for c in (alone, product)]
     np.testing.assert_allclose(here[1], here[0], atol=1e-4)
+
+
+def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
+    """Without the spot its depth is 0, and not its size. Fits chose the spot: no member is more probable."""
+    spot = Blemish.of(SMALL.context(), x=0.1, y=0.05, size=0.1, depth=0.02)
+    calset = simulate(SMALL, seed=5, effects=[spot]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    result = fit(Likelihood.of(calset, with_effects(base_model(calset), [spot], context)))
+    rivals = [
+        probe
+        for probe in grammar.sentences(result.model.template, calset.exposures, len(calset.points))
+        if probe.name == "gain of O1 * hours"
+    ]
+    state = examine(result, Hypotheses(sentences=rivals), np.random.default_rng(0))
+    (spots,) = ambiguities(state, context, {"blemish"}, [], alike=[p.name for p in rivals]).additions
+    assert spots.members[0].probability >= spots.members[1].probability
+    product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)), context)
+    values = dict(zip(product.model.names, product.values, strict=True))
+    fitted = dict(zip(result.model.names, result.values, strict=True))
+    for shape in ("blemish.x", "blemish.y", "blemish.size"):
+        assert values[shape] == fitted[shape]
+    weight = spots.members[0].probability
+    assert values["blemish.depth"] == pytest.approx(weight * fitted["blemish.depth"], rel=1e-9)
 
 
 def test_the_product_is_read_as_it_was_written(told, tmp_path):

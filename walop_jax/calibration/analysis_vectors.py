@@ -25,6 +25,7 @@ from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, w
 from walop_jax.calibration.matrix import sky_vectors, vector_slopes
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood.field_table import FieldTable, Vector, accurate_table, held_out
+from walop_jax.likelihood.inverses import square_root
 from walop_jax.likelihood.optics import plain_positions, through_series
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
@@ -91,8 +92,8 @@ class AnalysisVectors:
         series, plain = series_indices(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
         self.parameters: Int[np.ndarray, " n"] = np.concatenate([plain[self._uncertain], series])
-        value, vector = np.linalg.eigh(calibration.covariance[np.ix_(self.parameters, self.parameters)])
-        self.root: Float[np.ndarray, "n n"] = vector * np.sqrt(np.clip(value, 0.0, None))
+        covariance = calibration.covariance[np.ix_(self.parameters, self.parameters)]
+        self.root: Float[np.ndarray, "n n"] = square_root(covariance)
 
     @property
     def plain(self) -> int:

@@ -31,7 +31,7 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
-from walop_jax.diagnosis.exact import beyond_prior, signature
+from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
@@ -111,6 +111,7 @@ class Laid:
         self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
         self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
+        self.amplitudes = [i for name in model.effect_names for i in amplitude_positions(model, name)]
         far = (beyond_prior(self.fit, name).values() for name in model.effect_names)
         self.largest = PRIOR_EDGE * max(itertools.chain((1.0,), *far))
         self._vectors: Float[np.ndarray, "p k 3"] | None = None
@@ -145,6 +146,8 @@ class Laid:
         members += [twin for member in members if (twin := step.in_other_kinds(member)) is not None]
         best = max(member.evidence for member in members)
         least = best - thresholds.IMPROBABLE
+        # Exact fits chose the addition: where it is less probable by one linear step, the step is inaccurate.
+        addition = addition._replace(evidence=best)
         members = [addition, *(member for member in members[1:] if member.evidence > least)]
         changes = np.stack([member.change for member in members])
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
@@ -289,7 +292,8 @@ class LinearStep:
         change = np.column_stack([self.lost + column @ amplitudes, column])
         moved = -self.projector.taken_up(self.projector.basis.T @ change)
         values[self.rest], slopes[self.rest] = moved[:, 0], moved[:, 1:]
-        values[self.at] = -laid.fit.values[laid.fit.model.free[self.at]]
+        at = laid.fit.model.free[self.at]
+        values[self.at] = -laid.fit.values[at] * np.isin(at, laid.amplitudes)  # its shape remains
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values

@@ -79,12 +79,15 @@ class ClassOf(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Deviations from the shapes of all descriptions of a model, and errors of p of stars: from them, from the fit.
+    """Changes that are in the errors of a product and not in its values; errors of p of stars: from them, from the fit.
 
-    Those at the positions `on_stars` act on starlight, and are in the product (`Deviations`).
+    `moment` is E[c cᵀ] of their amplitudes c, `slopes` the change of the free parameters of the fit by each. Those at
+    the positions `on_stars` act on starlight, and are in the product (`Deviations`).
     """
 
-    deviations: Likeness
+    changes: tuple[Sentence, ...]
+    moment: Matrix
+    slopes: Matrix
     on_stars: tuple[int, ...]
     spread: float
     stated: float
@@ -115,10 +118,8 @@ class Classes(NamedTuple):
 
     def deviations(self, model: Model, context: Context) -> Deviations | None:
         """The effect that includes all that acts on stars, zero; None if nothing does."""
-        changes = [shape.deviations.sums[j][0][1] for shape in self.shapes for j in shape.on_stars]
-        described = (
-            [] if self.shape is None else [self.shape.deviations.sums[j][0][1] for j in self.shape.on_stars]
-        )
+        described = [] if self.shape is None else [self.shape.changes[j] for j in self.shape.on_stars]
+        changes = [shape.changes[j] for shape in self.shapes for j in shape.on_stars]
         polariser = model.template.polariser
         # Ahead of the polariser no element may depend on exposures; its light may.
         ahead = None if polariser is None else ("ahead of", polariser.name)
@@ -183,12 +184,9 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
         values += mean - start
         covariance += average - fitted
     for shape in classes.shapes:  # the model that was fitted remains: its parameters are as free as before
-        deviations = shape.deviations
-        sums = [total if j in shape.on_stars else () for j, total in enumerate(deviations.sums)]
-        amplitudes = _derivatives(model, Deviations.name, sums)
-        slopes = into @ deviations.slopes + amplitudes
-        values += into @ deviations.values + amplitudes @ deviations.amplitudes
-        covariance += slopes @ deviations.covariance @ slopes.T
+        sums = [((1.0, c),) if j in shape.on_stars else () for j, c in enumerate(shape.changes)]
+        slopes = into @ shape.slopes + _derivatives(model, Deviations.name, sums)
+        covariance += slopes @ shape.moment @ slopes.T
     # Held at their values: fits of other data would not constrain them.
     held = [
         dataclasses.replace(p, free=False, start=float(value)) if p.part == Deviations.name else p

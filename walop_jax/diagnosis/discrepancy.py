@@ -2,13 +2,15 @@
 
 Shape        A description without a name is the simplest one that explains the data: a polynomial over the field, one
              law over the exposures, one kind of polarisation. Its cause has no reason to be so simple. Deviations from
-             it are a Gaussian process, marginalised by one linear step,
+             it are a Gaussian process,
                  δ(x, t) = Σ_j c_j f_j(x, t),   c_j ~ N(0, s²/(n ⟨f_j²⟩))
              f_j products of a pattern over the field (all polynomials to the third degree), a law over the exposures
              (none, those of the descriptions, other slow ones) for each kind of polarisation (`GENERATORS`; of cameras
-             and other numbers the kind itself); s rms size of the descriptions of that place in the data, n patterns ×
-             laws: every kind may be as large as what was described, in any shape. In a product, stars have those
-             without a dependence and with those described; others change the parameters alone.
+             and other numbers the kind itself); n patterns × laws, s rms size of the descriptions of that place in the
+             data: every kind may be as large as what was described, in any shape. In a product, stars have those
+             without a dependence and with those described; others change the parameters alone. With mean c and
+             covariance C of the amplitudes by one linear step, E[c cᵀ] = C + c cᵀ is added to the covariance; values
+             stay those of the fit: of hundreds of amplitudes, the mean is mostly noise.
 Undetected   Elements that the model does not let vary have errors of 10⁻⁶, which no experiment has. Further changes of
              polarisation δ may be there: at a place of the train, a diattenuation, retardance or depolarisation,
              over the field of one degree d ≤ 3, with the prior widths of its kind at all `score.SCALES`. Each of these
@@ -38,12 +40,13 @@ from scipy import special
 
 from walop_jax.calibration.matrix import of_matrix
 from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
-from walop_jax.diagnosis.class_product import Classes, Likeness, Shape, Sum
+from walop_jax.diagnosis.class_product import Classes, Shape, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.score import SCALES, Matrix, Vector
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.inverses import square_root
 from walop_jax.model.effects import Context, Described, FreeForm
 from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
 from walop_jax.model.effects.change import Change as Sentence
@@ -97,17 +100,18 @@ def shape_of(laid: Laid) -> Shape | None:
     sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
     step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
     column = laid.design.stacked([laid.columns.of(sums)])
-    likeness = step.member("", sums, column, widths, 0.0)
-    slopes = _slopes(laid, sums, likeness.slopes)
-    between = slopes @ likeness.covariance @ np.swapaxes(slopes, 1, 2)
-    between += likeness.change[:, :, None] * likeness.change[:, None, :]
+    member = step.member("", sums, column, widths, 0.0)
+    moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
+    slopes = _slopes(laid, sums, member.slopes)
+    between = slopes @ moment @ np.swapaxes(slopes, 1, 2)
     # At another temperature stars have terms that are zero in the usual setting.
     steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
     _, at_any = laid.added([((1.0, change),) for change in steady])
     acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
     # Of other dependences than those described stars have none: each is a program's worth of derivatives.
     on_stars = tuple(j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws)
-    return Shape(likeness, on_stars, laid.error_of_p(between), laid.stated)
+    spread = laid.error_of_p(between)
+    return Shape(tuple(changes), moment, member.slopes, on_stars, spread, laid.stated)
 
 
 _OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
@@ -229,7 +233,7 @@ def undetected(laid: Laid) -> Shape | None:
         return None
     moments = _second_moments(tried, laid.state.floor)
     factors = [  # of the covariance of the matrix, its columns in units of the standard errors
-        _slopes(laid, block.sums, block.slopes) @ _root(moment)
+        _slopes(laid, block.sums, block.slopes) @ square_root(moment)
         for block, moment in zip(tried, moments, strict=True)
     ]
     errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
@@ -239,19 +243,10 @@ def undetected(laid: Laid) -> Shape | None:
     chosen, loadings = _carrying((slopes / errors).reshape(laid.errors.size, -1), factor)
     if not chosen:
         return None
-    covariance, count = loadings @ loadings.T, len(laid.fit.model.free)
+    covariance = loadings @ loadings.T
     between = slopes[..., chosen] @ covariance @ np.swapaxes(slopes[..., chosen], 1, 2)
-    likeness = Likeness(
-        name="",
-        evidence=0.0,
-        sums=tuple(ahead.sums[j] for j in chosen),
-        amplitudes=np.zeros(len(chosen)),
-        covariance=covariance,
-        values=np.zeros(count),
-        slopes=ahead.slopes[:, chosen],
-        change=np.zeros_like(laid.matrix),
-    )
-    return Shape(likeness, tuple(range(len(chosen))), laid.error_of_p(between), laid.stated)
+    acting, spread = tuple(ahead.sums[j][0][1] for j in chosen), laid.error_of_p(between)
+    return Shape(acting, covariance, ahead.slopes[:, chosen], tuple(range(len(chosen))), spread, laid.stated)
 
 
 def _steady_places(laid: Laid) -> list[tuple[str, str]]:
@@ -294,31 +289,22 @@ def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) 
 def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
     """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
     prior, moments = EXPECTED / max(sum(len(block.groups) for block in blocks), 2), []
+    odds = np.full(len(SCALES), np.log(prior / (1.0 - prior) / len(SCALES)))
     for block in blocks:
         moment = np.zeros_like(block.gram)
         for group in block.groups:
-            widths = block.widths[group]
-            value, vector = np.linalg.eigh(block.gram[np.ix_(group, group)] * np.outer(widths, widths))
+            at, widths = np.ix_(group, group), block.widths[group]
+            value, vector = np.linalg.eigh(block.gram[at] * np.outer(widths, widths))
             value, along = np.clip(value, 0.0, None), vector.T @ (block.scores[group] * widths)
-            shrunk = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
+            variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
             log_factors = 0.5 * np.sum(
-                shrunk * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0
+                variance * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0
             )
-            # Odds of each scale against nothing.
-            odds = np.log(prior / (1.0 - prior) / len(SCALES)) + log_factors / floor**2
-            mean, vector = shrunk * along[:, None], widths[:, None] * vector
-            for weight, variance, c in zip(special.softmax([*odds, 0.0]), shrunk.T, mean.T, strict=False):
-                moment[np.ix_(group, group)] += (
-                    weight * (vector * variance + np.outer(vector @ c, c)) @ vector.T
-                )
+            weight = special.softmax([*(odds + log_factors / floor**2), 0.0])[:-1]
+            mean, vector = variance * along[:, None], widths[:, None] * vector
+            moment[at] = vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
         moments.append(moment)
     return moments
-
-
-def _root(covariance: Matrix) -> Matrix:
-    """A factor F of a covariance F Fᵀ."""
-    value, vector = np.linalg.eigh(covariance)
-    return vector * np.sqrt(np.clip(value, 0.0, None))
 
 
 def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:

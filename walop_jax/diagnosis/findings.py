@@ -515,7 +515,7 @@ def _shape(shape: Shape | None) -> dict[str, Any] | None:
     if shape is None:
         return None
     return {
-        "deviations": len(shape.deviations.sums),
+        "deviations": len(shape.changes),
         "spread_of_p": shape.spread,
         "stated_error_of_p": shape.stated,
     }

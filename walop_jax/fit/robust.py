@@ -25,6 +25,7 @@ from walop_jax.fit.search import free_scales
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelExpansion, Vector
+from walop_jax.likelihood.inverses import root_of
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Expansion, Likelihood, Matrix
 
@@ -76,12 +77,10 @@ def larger(one: Matrix, other: Matrix) -> Matrix:
     Smallest among those that share their principal axes: where one is the unit matrix, the eigenvalues of the other
     are raised to 1.
     """
-    value, vector = np.linalg.eigh(0.5 * (one + one.T))
-    root = vector * np.sqrt(np.clip(value, 0.0, None))
-    significant = value > 1e-15 * value[-1]
-    whiten = (vector[:, significant] / np.sqrt(value[significant])).T
+    (root,) = root_of(0.5 * (one + one.T)[None], 1e-15)
+    whiten = (root / np.sum(root**2, axis=0)).T
     ratio, axis = np.linalg.eigh(whiten @ other @ whiten.T)
-    spread = root[:, significant] @ axis
+    spread = root @ axis
     return (spread * np.maximum(ratio, 1.0)) @ spread.T
 
 

@@ -48,11 +48,17 @@ def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:
     return matrix / length, length
 
 
+def square_root(covariance: Float[np.ndarray, "*r n n"]) -> Float[np.ndarray, "*r n n"]:
+    """F with F Fᵀ the covariance, columns by size, smallest first; negative eigenvalues are rounding."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.clip(value, 0.0, None))[..., None, :]
+
+
 def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
     """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
-    value, vector = np.linalg.eigh(matrices)
-    rank = int((value > least * value[:, -1:]).sum(axis=1).max())
-    return vector[:, :, -rank:] * np.sqrt(np.clip(value[:, None, -rank:], 0.0, None))
+    root = square_root(matrices)
+    value = np.sum(root**2, axis=1)
+    return root[:, :, -int((value > least * value[:, -1:]).sum(axis=1).max()) :]
 
 
 def of_low_rank(responses: Float[np.ndarray, "*p e k c"]) -> Float[np.ndarray, "*p e k c"]:

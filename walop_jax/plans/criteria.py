@@ -26,7 +26,7 @@ from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
 from walop_jax.diagnosis import thresholds
-from walop_jax.likelihood.inverses import root_of
+from walop_jax.likelihood.inverses import root_of, square_root
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import check_names
 from walop_jax.plans.exposures import Candidates
@@ -91,9 +91,7 @@ class FieldErrors:
 
     def targets(self) -> Float[np.ndarray, "r k f 6"]:
         """Linear functions of the parameters whose summed variance is the mean square error of p, in %²."""
-        value, vector = np.linalg.eigh(self.forms)
-        root = vector * np.sqrt(np.clip(value, 0.0, None))[..., None, :]
-        return 100.0 * np.einsum("rpif,rpij->rpfj", self.slopes, root)[:, self.seen]
+        return 100.0 * np.einsum("rpif,rpij->rpfj", self.slopes, square_root(self.forms))[:, self.seen]
 
     def error(self, covariance: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, "r p"]:
         """Error of p (fraction) for covariances of the parameters; NaN where there is no u."""

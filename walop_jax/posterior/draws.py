@@ -22,6 +22,7 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import InputFile
 from walop_jax.io.errors import fail
+from walop_jax.likelihood.inverses import square_root
 
 if TYPE_CHECKING:  # slow to import, and most commands read no posterior
     from xarray import Dataset, DataTree
@@ -120,9 +121,8 @@ def with_draws(calibration: Calibration, path: Any, count: int = DRAWS) -> Calib
     draws, rng = _draws_of(calibration, path), np.random.default_rng(0)
     chosen, fitted = rng.permutation(len(draws))[:count], calibration.fitted
     # Deviations that a diagnosis adds are independent of the fit.
-    value, vector = np.linalg.eigh(calibration.widened(np.zeros((len(fitted), len(fitted)))))
-    normal = rng.standard_normal((len(chosen), len(value)))
-    whole = calibration.values + normal @ (vector * np.sqrt(np.clip(value, 0.0, None))).T
+    root = square_root(calibration.widened(np.zeros((len(fitted), len(fitted)))))
+    whole = calibration.values + rng.standard_normal((len(chosen), len(root))) @ root.T
     whole[:, fitted] += draws[chosen] - calibration.values[fitted]
     return dataclasses.replace(calibration, draws=whole)
 
