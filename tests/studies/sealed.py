@@ -422,7 +422,7 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
         after = judged(_with_undetected(fitted), True, one) if fitted.trusted else None
         return Outcome(one.text, held, before, after, "", np.nan, False, time.process_time() - began)
     try:
-        found = diagnose(one.calset, seed=number, minutes=options.minutes)
+        found = diagnose(one.calset, minutes=options.minutes)
     except (DataError, ValueError) as error:
         return Outcome(
             one.text,
