@@ -302,7 +302,7 @@ class Blind:
 
     # --------------------------------------------------------------------------------------------------- judging
 
-    @functools.lru_cache(2)  # noqa: B019
+    @functools.lru_cache(32)  # noqa: B019
     def _asked(self, removed: tuple[str, ...]) -> Evidence:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]

@@ -202,12 +202,12 @@ class ScoreSpace:
         products, alone = np.zeros((count, count)), [np.zeros((size, size)) for size in sizes]
         for first in range(0, len(basis), limits.PRODUCT_ROWS):
             rows = slice(first, first + limits.PRODUCT_ROWS)
-            remainder = basis[rows] @ -along
+            remainder = along.T @ -basis[rows].T  # a column of all rows is contiguous
             for at, block, square in zip(places, columns, alone, strict=True):
-                rows_of_block = block[rows]
-                remainder[: len(rows_of_block), at] += rows_of_block / scale
-                square += remainder[:, at].T @ remainder[:, at]
-            products += gram(remainder, exact)
+                rows_of_block = block[rows].T
+                remainder[at, : rows_of_block.shape[1]] += rows_of_block / scale
+                square += remainder[at] @ remainder[at].T
+            products += gram(remainder.T, exact)
         for at, square in zip(places, alone, strict=True):
             products[at, at] = square
         return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, products, projector.free)
