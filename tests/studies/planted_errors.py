@@ -128,7 +128,7 @@ ERRORS = (
             "start[place] += one_wave", "fit/test_search.py"),
     planted("fit/robust.py", "count / (count - 1) * gradients.T", "(count - 1) / count * gradients.T",
             "fit/test_robust.py"),
-    planted("fit/robust.py", "root[:, significant] @ axis", "root[:, significant] @ axis.T", "fit/test_robust.py"),
+    planted("fit/robust.py", "spread = root @ axis", "spread = root @ axis.T", "fit/test_robust.py"),
     # calibration
     planted("calibration/calibration.py", "0.5 * (result.covariance + result.covariance.T)",
             "0.25 * (result.covariance + result.covariance.T)", "calibration/test_calibration.py"),
