@@ -513,10 +513,10 @@ def table(outcomes: list[Outcome]) -> str:
         rate(f"{wrong}, all", (j.wrong for _, j in trusted))
         rate(f"{wrong}, by stars", (j.beyond > FEW for _, j in trusted))
         rate(f"{wrong}, something stated", (j.wrong for o, j in trusted if o.right and name == "diagnosis"))
-        expected = sum(j.chance for _, j in trusted)
-        rows.append(
-            (f"{name}: of these by chance, from their own covariances", f"{expected:.1f} of {len(trusted)}")
-        )
+        for least in (-np.inf, HELD):
+            chances = [j.chance for o, j in trusted if o.held >= least]
+            words = f"{name}: by chance, from their own covariances" + f", Δχ² ≥ {least:g}" * (least == HELD)
+            rows.append((words, f"{sum(chances):.1f} of {len(chances)}"))
     both = [(o, o.before, o.after) for o in products if o.before is not None and o.after is not None]
     rate(
         "matrix worse by more than 1.2 × after the diagnosis", (a.error > WORSE * b.error for _, b, a in both)
