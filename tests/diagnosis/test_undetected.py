@@ -7,8 +7,10 @@ from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
+from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import Laid, LinearStep
 from walop_jax.diagnosis.class_product import Classes, averaged
-from walop_jax.diagnosis.discrepancy import _Block, _carrying, _second_moments, ambiguities
+from walop_jax.diagnosis.discrepancy import _Block, _carrying, _of_other_light, _second_moments, ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
@@ -24,9 +26,9 @@ AHEAD, SIZE = "retardance v ahead of polariser", 4e-4
 """Turns q and u of all light from the sky, which standards of 3 % with errors of 2·10⁻⁴ hardly show."""
 
 
-def fitted(seed: int, *texts: str):
+def fitted(seed: int, *texts: str, size: float = SIZE):
     """A fit of the base model, what may be undetected, and the truth of the set."""
-    effects = [Described.saying(list(texts), [SIZE] * len(texts))] if texts else []
+    effects = [Described.saying(list(texts), [size] * len(texts))] if texts else []
     simulation = simulate(SMALL, seed=seed, effects=effects)
     result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
     context = effect_context(result.model.template, result.calset.exposures)
@@ -107,6 +109,37 @@ def test_what_is_hidden_lies_within_the_errors():
         worst.append(np.median(pulls, axis=0).max())
     assert worst[0] > 4.0
     assert worst[1] < 2.0
+
+
+def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sound):
+    """E[c²] of its size by quadrature, times the shifts of a fit to the same noise with the drift hidden."""
+    drift, size = "turn of polariser * hours", 0.3
+    result, _, _ = sound
+    other, _, _ = fitted(3, drift, size=size)
+    free = result.model.free
+    shift = (other.values - result.values)[free] / size
+    asked = grammar.sentences(result.model.template, result.calset.exposures, len(result.calset.points))
+    (probe,) = (probe for probe in asked if probe.name == drift)
+    state = examine(result, Hypotheses(sentences=[probe]), np.random.default_rng(0))
+    laid = Laid(state, ())
+    root = _of_other_light(laid, LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows)))
+    at = state.bare.places()[probe.name]
+    square = state.bare.gram[at, at].item()
+    left = laid.design.projector(laid.design.residual)[: laid.design.rows]
+    score = float(state.candidates[probe.name].columns[:, 0] @ left)
+    evidence, moment = 0.0, 0.0
+    for scale in (1.0, 0.3, 0.1, 0.03):
+        width = scale * probe.widths[0]
+        c = np.linspace(-8.0, 8.0, 200_001) * width
+        density = stats.norm.pdf(c, scale=width) * np.exp(-0.5 * square * c**2 - score * c) / 4
+        evidence += integrate.trapezoid(density, c)
+        moment += integrate.trapezoid(c**2 * density, c)
+    moment /= 1.0 + evidence  # there or not, at even odds
+    errors = np.sqrt(np.diag(result.covariance)[free])
+    moved = np.sqrt(moment) * shift / errors
+    np.testing.assert_allclose(
+        np.linalg.norm(root / errors[:, None], axis=1), np.abs(moved), atol=0.05 * np.abs(moved).max()
+    )
 
 
 def test_draws_of_a_posterior_keep_what_is_undetected(sound, monkeypatch):

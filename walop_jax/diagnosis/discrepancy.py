@@ -18,13 +18,14 @@ Undetected   Elements that the model does not let vary have errors of 10⁻⁶, 
              evidence B_g of one linear step,
                  E[δδᵀ] = Σ_g p_g (C_g + c_g c_gᵀ),   p_g = π B_g / (1 − π + π B_g)
              is added to the covariance; values stay those of the fit. Changes that data exclude add nothing, those
-             without any trace in them their prior, those suggested without an alarm their size.
+             without any trace in them their prior, those suggested without an alarm their size. One more is expected
+             among the candidates of the examination that stars do not have (in time, temperature, KIND, counts, single
+             exposures): it moves the parameters alone.
 Starlight    Any such change acts on a star, to first order, as one ahead of the train does: few of these, chosen one
              after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
              models that were not chosen, Draper 1995, J. R. Stat. Soc. B 57, 45
-Limits       First order; in the usual setting of the plates. Undetected changes of detectors, in single exposures and
-             of finer structure are not in it.
+Limits       First order; in the usual setting of the plates. Undetected changes of finer structure are not in it.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, Shape, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
+from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import SCALES, Matrix, Vector
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
@@ -52,6 +54,7 @@ from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.optics import GENERATORS, generators_of
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import mean_wavelengths
 
 EXPECTED = 1.0  # number of undetected changes beforehand
@@ -236,6 +239,8 @@ def undetected(laid: Laid) -> Shape | None:
         _slopes(laid, block.sums, block.slopes) @ square_root(moment)
         for block, moment in zip(tried, moments, strict=True)
     ]
+    if laid.state.candidates:
+        factors.append(laid.slopes @ _of_other_light(laid, step))
     errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
     factor = (np.concatenate(factors, axis=-1) / errors).reshape(laid.errors.size, -1)
     ahead = blocks[front]
@@ -288,23 +293,56 @@ def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) 
 
 def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
     """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
-    prior, moments = EXPECTED / max(sum(len(block.groups) for block in blocks), 2), []
-    odds = np.full(len(SCALES), np.log(prior / (1.0 - prior) / len(SCALES)))
+    odds, moments = _odds(sum(len(block.groups) for block in blocks)), []
     for block in blocks:
         moment = np.zeros_like(block.gram)
         for group in block.groups:
-            at, widths = np.ix_(group, group), block.widths[group]
-            value, vector = np.linalg.eigh(block.gram[at] * np.outer(widths, widths))
-            value, along = np.clip(value, 0.0, None), vector.T @ (block.scores[group] * widths)
-            variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
-            log_factors = 0.5 * np.sum(
-                variance * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0
-            )
-            weight = special.softmax([*(odds + log_factors / floor**2), 0.0])[:-1]
-            mean, vector = variance * along[:, None], widths[:, None] * vector
-            moment[at] = vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
+            at = np.ix_(group, group)
+            moment[at] = _second_moment(block.gram[at], block.scores[group], block.widths[group], odds, floor)
         moments.append(moment)
     return moments
+
+
+def _odds(groups: int) -> float:
+    """ln of the prior odds of one scale of one of some groups against its absence."""
+    prior = EXPECTED / max(groups, 2)
+    return float(np.log(prior / (1.0 - prior) / len(SCALES)))
+
+
+def _second_moment(gram: Matrix, scores: Vector, widths: Vector, odds: float, floor: float) -> Matrix:
+    """E[c cᵀ] of the amplitudes of a group, over its scales and its absence."""
+    value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
+    value, along = np.clip(value, 0.0, None), vector.T @ (scores * widths)
+    variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
+    log_factors = 0.5 * np.sum(variance * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0)
+    weight = special.softmax([*(odds + log_factors / floor**2), 0.0])[:-1]
+    mean, vector = variance * along[:, None], widths[:, None] * vector
+    return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
+
+
+def _of_other_light(laid: Laid, step: LinearStep) -> Matrix:
+    """A factor of the covariance of the free parameters by undetected changes of calibration exposures alone.
+
+    These are the candidates of an examination that depend on time, temperature, KIND, counts or an exposure, or that
+    are no light of a star.
+    """
+    state, count = laid.state, len(laid.fit.model.free)
+    probes = (*state.probes, *state.sentences, *(probe for probe, _ in state.parts))
+    absent = [probe for probe in probes if _no_starlight(probe, laid.template)]
+    scores, places = laid.design.products(state.columns, step.left), state.bare.places()
+    slopes = -step.projector.taken_up(laid.design.products(state.columns, step.projector.basis).T)
+    covariance, odds = np.zeros((count, count)), _odds(len(absent))
+    for probe in absent:
+        at = places[probe.name]
+        moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.floor)
+        covariance += slopes[:, at] @ moment @ slopes[:, at].T
+    return square_root(covariance)
+
+
+def _no_starlight(probe: Probe, template: Instrument) -> bool:
+    """True of a candidate that changes calibration exposures and not the light of stars."""
+    changes = [c for member in probe.group for total in member.first_order(template) for _, c in total]
+    return bool(changes) and all(change.beside_field or not change.of_stars for change in changes)
 
 
 def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:
