@@ -10,7 +10,14 @@ from walop_jax.calibration.matrix import first_setting, planned_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import Laid, LinearStep
 from walop_jax.diagnosis.class_product import Classes, averaged
-from walop_jax.diagnosis.discrepancy import _Block, _carrying, _of_other_light, _second_moments, ambiguities
+from walop_jax.diagnosis.discrepancy import (
+    _Block,
+    _carrying,
+    _no_starlight,
+    _of_other_light,
+    _second_moments,
+    ambiguities,
+)
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
@@ -140,6 +147,24 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
     np.testing.assert_allclose(
         np.linalg.norm(root / errors[:, None], axis=1), np.abs(moved), atol=0.05 * np.abs(moved).max()
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "absent"),
+    [
+        ("turn of polariser * hours", True),
+        ("gain of O1 * counts", True),
+        ("light in O1", True),
+        ("light of E1 in O1", False),
+        ("axis of half1.plate", False),
+        ("fringes of half1.plate * gap 1; fringes of half1.plate * gap 1.0775", False),
+    ],
+)
+def test_what_a_star_does_not_have(sound, name, absent):
+    template, calset = sound[0].model.template, sound[0].calset
+    asked = grammar.sentences(template, calset.exposures, len(calset.points))
+    (probe,) = (probe for probe in asked if probe.name == name)
+    assert _no_starlight(probe, template) == absent
 
 
 def test_draws_of_a_posterior_keep_what_is_undetected(sound, monkeypatch):

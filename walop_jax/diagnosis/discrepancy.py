@@ -53,6 +53,7 @@ from walop_jax.model.effects import Context, Described, FreeForm
 from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.deviations import CUBIC
+from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import mean_wavelengths
@@ -342,7 +343,8 @@ def _of_other_light(laid: Laid, step: LinearStep) -> Matrix:
 def _no_starlight(probe: Probe, template: Instrument) -> bool:
     """True of a candidate that changes calibration exposures and not the light of stars."""
     changes = [c for member in probe.group for total in member.first_order(template) for _, c in total]
-    return bool(changes) and all(change.beside_field or not change.of_stars for change in changes)
+    laws = ({item.depends_on for item in change.grows_with} & {EXPOSURE, COUNTS} for change in changes)
+    return bool(changes) and all(law or not c.of_stars for law, c in zip(laws, changes, strict=True))
 
 
 def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:
