@@ -206,7 +206,7 @@ def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
     partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     added = "; ".join(partial) or "a free-form term"
-    text = f"with what was found the model predicts worse {worse}, so nothing was adopted: {added}"
+    text = f"the model with all additions predicts worse {worse}, so nothing was adopted: {added}"
     remainder = _and(_unexplained(first.evidence, tuple(first.evidence.beside_patterns[0])), text)
     remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder
