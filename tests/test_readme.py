@@ -46,13 +46,13 @@ def test_version_is_one():
 
 
 def test_false_alarms_are_those_of_the_study():
-    """README said 0 for as long as the study has said 4."""
     study = (ROOT / "walop_jax" / "docs" / "validation.md").read_text(encoding="utf-8")
-    row = re.search(r"^\| false alarms, 1000 scenes .*in 9000 more: (\d+)\) \| (\d+) ", study, re.MULTILINE)
-    told = re.search(r"nothing hidden: false alarms \| (\d+); in 9000 more (\d+) \|", TEXT)
+    allowed = r"\(27 in 10 000 are allowed\) \| (\d+) \|"
+    row = re.search(rf"^\| false alarms, 1000 scenes with nothing hidden {allowed}", study, re.MULTILINE)
+    told = re.search(rf"1000 simulated scenes with nothing hidden: false alarms {allowed}", TEXT)
     assert row is not None
     assert told is not None
-    assert told.groups() == (row[2], row[1])
+    assert told[1] == row[1]
 
 
 def test_the_test_command_is_that_of_contributors_and_of_the_checks():
