@@ -195,6 +195,8 @@ def _worse(first: Examination, last: Examination) -> str:
     """Exposures that the final model predicts worse than the first, in words; empty: none."""
     if kinds := contradicting(first.design, last.design):
         return f"exposures of {kinds}, as all others predict them"
+    if FreeForm.name in last.result.model.effect_names:  # its numbers for single exposures predict no others
+        return ""
     before, after = (held_out(evidence.design, "exposures") for evidence in (first, last))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
         return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
