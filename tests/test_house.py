@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2651,
     "posterior": 2180,
     "science": 5809,
-    "diagnosis": 7850,
+    "diagnosis": 7863,
     "nights": 2682,
     "plans": 2222,
     "paper": 775,

@@ -134,6 +134,11 @@ class Laid:
         changes = [self._added[amplitude] for amplitude in sums]
         return self._vectors, np.stack(changes, axis=-1) if changes else np.zeros((*self._vectors.shape, 0))
 
+    @functools.cached_property
+    def nothing_removed(self) -> LinearStep:
+        """The linear step from the fit to the same model with further amplitudes."""
+        return LinearStep(self, np.zeros(0, int), np.zeros(self.design.rows))
+
     def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
         step = LinearStep(self, at, lost)
@@ -222,7 +227,7 @@ class LinearStep:
         along = design.products(state.columns, basis)
         gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
         places, scored = state.bare.places(), []
-        for probe in (*state.probes, *state.sentences, *(probe for probe, _ in state.parts)):
+        for probe in state.asked:
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
             if {probe.name, probe.effect.name} & set(self.laid.alike):

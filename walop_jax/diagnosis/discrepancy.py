@@ -45,7 +45,7 @@ from walop_jax.diagnosis.class_product import Classes, Shape, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.score import SCALES, Matrix, Vector
+from walop_jax.diagnosis.score import SCALES, Matrix, Vector, log_bayes_by_scale
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import square_root
@@ -102,7 +102,7 @@ def shape_of(laid: Laid) -> Shape | None:
     if not changes:
         return None
     sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
-    step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    step = laid.nothing_removed
     column = laid.design.stacked([laid.columns.of(sums)])
     member = step.member("", sums, column, widths, 0.0)
     moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
@@ -228,7 +228,7 @@ def undetected(laid: Laid) -> Shape | None:
     """Covariance of changes that the data would not show, as one of changes ahead of the train; None without any."""
     if not (places := _steady_places(laid)):
         return None
-    step = LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows))
+    step = laid.nothing_removed
     data, front = _AtData.of(laid.columns), places[0]
     blocks = {place: block for place in places if (block := _block(laid, step, data, *place)) is not None}
     # Without light from the sky nothing ahead of the polariser is in the data.
@@ -240,8 +240,7 @@ def undetected(laid: Laid) -> Shape | None:
         _slopes(laid, block.sums, block.slopes) @ square_root(moment)
         for block, moment in zip(tried, moments, strict=True)
     ]
-    if laid.state.candidates:
-        factors.append(laid.slopes @ _of_other_light(laid, step))
+    factors.append(laid.slopes @ _of_other_light(laid, step))
     errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
     factor = (np.concatenate(factors, axis=-1) / errors).reshape(laid.errors.size, -1)
     ahead = blocks[front]
@@ -314,9 +313,8 @@ def _second_moment(gram: Matrix, scores: Vector, widths: Vector, odds: float, fl
     """E[c cᵀ] of the amplitudes of a group, over its scales and its absence."""
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
     value, along = np.clip(value, 0.0, None), vector.T @ (scores * widths)
+    weight = special.softmax([*(odds + log_bayes_by_scale(value, along, SCALES) / floor**2), 0.0])[:-1]
     variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
-    log_factors = 0.5 * np.sum(variance * along[:, None] ** 2 - np.log1p(np.outer(value, SCALES**2)), axis=0)
-    weight = special.softmax([*(odds + log_factors / floor**2), 0.0])[:-1]
     mean, vector = variance * along[:, None], widths[:, None] * vector
     return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
 
@@ -328,8 +326,9 @@ def _of_other_light(laid: Laid, step: LinearStep) -> Matrix:
     are no light of a star.
     """
     state, count = laid.state, len(laid.fit.model.free)
-    probes = (*state.probes, *state.sentences, *(probe for probe, _ in state.parts))
-    absent = [probe for probe in probes if _no_starlight(probe, laid.template)]
+    absent = [probe for probe in state.asked if _no_starlight(probe, laid.template)]
+    if not absent:
+        return np.zeros((count, 0))
     scores, places = laid.design.products(state.columns, step.left), state.bare.places()
     slopes = -step.projector.taken_up(laid.design.products(state.columns, step.projector.basis).T)
     covariance, odds = np.zeros((count, count)), _odds(len(absent))

@@ -123,6 +123,11 @@ class Evidence:
     dof: int
     scale: float = 1.0
 
+    @property
+    def asked(self) -> tuple[Probe, ...]:
+        """All candidates but patterns."""
+        return (*self.probes, *self.sentences, *(probe for probe, _ in self.parts))
+
     @cached_property
     def ranked(self) -> list[Ranked]:
         """Effects in order of evidence."""

@@ -37,7 +37,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     adopted = state.steps or (remainder is not None and remainder.free_form)
-    if adopted and (worse := _worse(first.evidence, state.evidence)):
+    if adopted and (worse := _worse(first.evidence, state)):
         return _not_adopted(first, state, worse)
     added = tuple(name for step in state.steps for name in step.groups)  # groups of sentences
     if remainder is not None:
@@ -191,13 +191,13 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
 # ------------------------------------------------------------------------------------ models not adopted
 
 
-def _worse(first: Examination, last: Examination) -> str:
+def _worse(first: Examination, state: State) -> str:
     """Exposures that the final model predicts worse than the first, in words; empty: none."""
-    if kinds := contradicting(first.design, last.design):
+    if kinds := contradicting(first.design, state.evidence.design):
         return f"exposures of {kinds}, as all others predict them"
-    if FreeForm.name in last.result.model.effect_names:  # its numbers for single exposures predict no others
+    if not state.steps:  # numbers of a free-form term for single exposures predict no others
         return ""
-    before, after = (held_out(evidence.design, "exposures") for evidence in (first, last))
+    before, after = (held_out(evidence.design, "exposures") for evidence in (first, state.evidence))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
         return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
     return ""

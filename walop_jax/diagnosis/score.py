@@ -355,9 +355,7 @@ class _Root:
         return float(solution @ solution)
 
 
-def log_bayes(
-    gram: Matrix, scores: Vector, widths: Vector, scales: Float[np.ndarray, " t"] = SCALES
-) -> float:
+def log_bayes(gram: Matrix, scores: Vector, widths: Vector, scales: Vector = SCALES) -> float:
     """ln B of a linear effect against the base: exact, that of several numbers averaged over scales t of their widths.
 
         B = ⟨exp(½ sᵀ (G + Λ⁻¹/t²)⁻¹ s) / det(1 + t² Λ^½ G Λ^½)^½⟩ over t, Λ^½ the prior widths
@@ -366,11 +364,17 @@ def log_bayes(
     which is unknown: all scales are as probable beforehand (mixtures of priors: Liang et al. 2008, JASA 103, 410).
     """
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
-    t = (scales if len(widths) > 1 else np.ones(1))[:, None] ** 2
-    # None is below 0: rounding of columns that are nearly alike must not make it so.
-    value, s = t * np.clip(value, 0.0, None), vector.T @ (scores * widths)
-    log_factors = 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
+    scales = scales if len(widths) > 1 else np.ones(1)
+    log_factors = log_bayes_by_scale(value, vector.T @ (scores * widths), scales)
     return float(np.logaddexp.reduce(log_factors) - np.log(len(log_factors)))
+
+
+def log_bayes_by_scale(value: Vector, s: Vector, scales: Vector) -> Vector:
+    """ln B at each scale t, of numbers whose Gram matrix is diagonal: `value` and scores `s` in prior widths."""
+    t = scales[:, None] ** 2
+    # None is below 0: rounding of columns that are nearly alike must not make it so.
+    value = t * np.clip(value, 0.0, None)
+    return 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
 
 
 def _log_of_chi2(statistic: Any, rank: int) -> Any:
