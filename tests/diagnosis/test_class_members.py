@@ -125,12 +125,26 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     assert len(said) == 2
     result = fit(Likelihood.of(calset, model))
     state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    classes = ambiguities(state, context, {Described.name}, [leak], alike=[rival])
+    classes = ambiguities(state, context, {Described.name}, [leak], alike={Described.name: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
     alone = Calibration.from_fit(result.judged())
     product = averaged(alone, classes, context)
     here = [c.matrix(calset.points.x, calset.points.y)[0] for c in (alone, product)]
     np.testing.assert_allclose(here[1], here[0], atol=1e-4)
+
+
+def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_another():
+    """A retardance that lens birefringence may be explains no spot."""
+    rival = "gain of O1 * hours"
+    spot = Blemish.of(SMALL.context(), x=0.1, y=0.05, size=0.1, depth=0.02)
+    calset = simulate(SMALL, seed=5, effects=[spot]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    result = fit(Likelihood.of(calset, with_effects(base_model(calset), [spot], context)))
+    asked = grammar.sentences(result.model.template, calset.exposures, len(calset.points))
+    probes = Hypotheses(sentences=[probe for probe in asked if probe.name == rival])
+    state = examine(result, probes, np.random.default_rng(0))
+    classes = ambiguities(state, context, {"blemish"}, [], alike={"lens_birefringence": [rival]})
+    assert classes.additions == ()
 
 
 def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
@@ -145,7 +159,9 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
         if probe.name == "gain of O1 * hours"
     ]
     state = examine(result, Hypotheses(sentences=rivals), np.random.default_rng(0))
-    (spots,) = ambiguities(state, context, {"blemish"}, [], alike=[p.name for p in rivals]).additions
+    (spots,) = ambiguities(
+        state, context, {"blemish"}, [], alike={"blemish": [p.name for p in rivals]}
+    ).additions
     assert spots.members[0].probability >= spots.members[1].probability
     product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)), context)
     values = dict(zip(product.model.names, product.values, strict=True))

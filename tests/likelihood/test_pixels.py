@@ -226,6 +226,7 @@ def test_cells_cover_frames_of_any_shape():
     assert (s[0], s[-1], t[0], t[-1]) == (-1.0, 1.0, -1.0, 1.0)
     # The middle of the first pixel.
     assert cells.field(s[0] + 1 / 300, t[0] + 1 / 71) == pytest.approx((0.0, 0.0))
+    assert cells.place(*cells.field(0.3, -0.7)) == pytest.approx((0.3, -0.7))
 
 
 # ------------------------------------------------------------------------------------ the set that stands for them

@@ -18,6 +18,7 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import COOL, HOT, apply
@@ -141,6 +142,34 @@ def _brute_force(calibration, catalogue):
             qu = qu + np.linalg.lstsq(np.concatenate(jacobian), np.concatenate(residual), rcond=None)[0]
         out.append(qu)
     return np.array(out)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.003])
+def test_stars_behind_a_small_spot(calibration, size):
+    """No series over the field is accurate beside it, nor do its usual places show the smaller one at all.
+
+    Intensities of the camera fall by the depth at the centre, by exp(−1/2) of it at one standard deviation.
+    """
+    context = effect_context(calibration.model.template, calibration.exposures)
+    spot = Blemish.of(context, x=0.11, y=-0.07, size=size, depth=0.1, camera=2)
+    model = with_effects(calibration.model, [spot], context)
+    place = [model.index(name) for name in calibration.model.names]
+    values, covariance = np.array([p.start for p in model.parameters]), np.zeros((len(model.names),) * 2)
+    values[place], covariance[np.ix_(place, place)] = calibration.values, calibration.covariance
+    free = model.positions("blemish")
+    covariance[free, free] = 1e-6
+    spotted = AnalysisVectors(
+        dataclasses.replace(calibration, model=model, values=values, covariance=covariance, hidden=None)
+    )
+    x, y, teff = np.array([0.11, 0.11 + size, -0.1]), np.full(3, -0.07), np.full(3, np.nan)
+    share = np.exp([0.0, -0.5, -((0.21 / size) ** 2) / 2.0])
+    clean = AnalysisVectors(calibration).coloured(setting(None), x, y)
+    ratio = spotted.coloured(setting(None), x, y) / clean
+    np.testing.assert_allclose(ratio[:, 2, 0], 1.0 - 0.1 * share, atol=1e-6)
+    at = [name for name, _ in spotted.named].index("blemish.depth")
+    slopes = spotted.derivatives(setting(None), x, y, teff).plain[..., 0, at]
+    np.testing.assert_allclose(slopes[:, 2], -share * clean[:, 2, 0], atol=1e-3)
+    np.testing.assert_allclose(slopes[:, [0, 1, 3]], 0.0, atol=1e-12)
 
 
 def test_sky_is_the_instrument_turned(vectors, calibration, tmp_path):

@@ -4,7 +4,8 @@
 
 The vectors of one optical setting (filter, moving elements, temperature, hour angle) are computed at a few hundred
 field points and colours and interpolated between them; every table is checked against vectors computed where it has
-no node (`likelihood/field_table.py`). A setting has one table, whatever the catalogue that asks for it.
+no node (`likelihood/field_table.py`). A setting has one table, whatever the catalogue that asks for it. Where none is
+accurate, as beside a small spot, all is computed at every star.
 
 The derivatives have the structure of the fit (`likelihood/field_table.py`): plain parameters act directly, the
 throughput series only through its local values.
@@ -24,7 +25,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
 from walop_jax.calibration.matrix import sky_vectors, vector_slopes
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood.field_table import FieldTable, Vector, accurate_table, held_out
+from walop_jax.likelihood.field_table import Vector, accurate_table, details_of, held_out
 from walop_jax.likelihood.inverses import square_root
 from walop_jax.likelihood.optics import plain_positions, through_series
 from walop_jax.model import chebyshev
@@ -38,6 +39,8 @@ from walop_jax.model.specification import series_indices
 
 Vectors = Float[np.ndarray, "p k 3"]  # point, camera, Stokes
 Values = Float[np.ndarray, "p f"]  # of a table
+OverField = Callable[[Vector, Vector], Values]
+"""Values at field positions (deg): a table, or an exact function."""
 
 COLOURS = 12  # colour temperatures of the vectors
 DERIVATIVE_COLOURS = 3
@@ -87,7 +90,8 @@ class AnalysisVectors:
         reach = REACH * float(np.abs(calibration.field).max())
         self.half_width = min(self.instrument.field_limit, reach)
         self.cameras = len(self.instrument.cameras)
-        self._tables: dict[tuple[object, ...], FieldTable] = {}
+        self._tables: dict[tuple[object, ...], OverField] = {}
+        self._details = details_of(self.instrument)
         self._acting_in: dict[tuple[object, ...], dict[int, Effect]] = {}
         series, plain = series_indices(self.instrument), plain_positions(self.instrument)
         self._uncertain: Int[np.ndarray, " o"] = np.flatnonzero(np.diag(calibration.covariance)[plain] > 0)
@@ -185,7 +189,7 @@ class AnalysisVectors:
         plan = plan_for_settings(self.instrument, same, self.calibration.curves(setting))
         return plan, np.asarray(plan.band_of)[:, 0]
 
-    def _kept(self, make: Callable[[Settings], FieldTable], setting: Settings, name: str = "") -> FieldTable:
+    def _kept(self, make: Callable[[Settings], OverField], setting: Settings, name: str = "") -> OverField:
         """The interpolated function of one setting, in the order (colour, camera, Stokes, …), made when asked for."""
         key = (name or make.__name__, setting.key)
         if key not in self._tables:
@@ -197,7 +201,7 @@ class AnalysisVectors:
         corner = np.full(2, self.half_width)
         return Rectangle(-corner, corner)
 
-    def _vector_table(self, setting: Settings) -> FieldTable:
+    def _vector_table(self, setting: Settings) -> OverField:
         nodes = colour_nodes(COLOURS).tolist()
         teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
@@ -212,10 +216,10 @@ class AnalysisVectors:
 
         # As many colours as on the nodes, for whose number the program is there.
         colours = (*BETWEEN, *nodes[len(BETWEEN) - 1 :])
-        truth = self.exact(setting, *held_out(self._rectangle), colours)[:, : len(BETWEEN)]
+        truth = self.exact(setting, *held_out(self._rectangle, self._details), colours)[:, : len(BETWEEN)]
         return self._accurate(exact, NODES, TOLERANCE, error, truth)
 
-    def _derivative_table(self, setting: Settings) -> FieldTable:
+    def _derivative_table(self, setting: Settings) -> OverField:
         plan, bands = self._plan(setting, [np.nan, *colour_nodes(DERIVATIVE_COLOURS).tolist()])
         plain = plain_positions(self.instrument).size
         columns = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
@@ -233,7 +237,7 @@ class AnalysisVectors:
 
         return self._accurate(exact, DERIVATIVE_NODES, DERIVATIVE_TOLERANCE, error)
 
-    def _acting_table(self, setting: Settings, acting: Mapping[int, Effect]) -> FieldTable:
+    def _acting_table(self, setting: Settings, acting: Mapping[int, Effect]) -> OverField:
         filters = self.calibration.curves(setting)
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
@@ -252,10 +256,9 @@ class AnalysisVectors:
         return self._accurate(exact, DERIVATIVE_NODES, ADDED_TOLERANCE, error)
 
     def _accurate(
-        self, exact: Any, counts: Sequence[int], tolerance: float, error: Any, truth: Any = None
-    ) -> FieldTable:
-        table, off = accurate_table(exact, self._rectangle, counts, tolerance, error, truth=truth, total=True)
-        if table is None or not off <= tolerance:
-            what = f"the optics vary too fast over the field to be interpolated (error {off:.1e}, {tolerance:g} is"
-            raise RuntimeError(f"{what} needed); an effect of the model has a very small scale")
-        return table
+        self, exact: OverField, counts: Sequence[int], tolerance: float, error: Any, truth: Any = None
+    ) -> OverField:
+        table, off = accurate_table(
+            exact, self._rectangle, counts, tolerance, error, truth=truth, total=True, details=self._details
+        )
+        return exact if table is None or not off <= tolerance else table

@@ -24,7 +24,7 @@ from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Structure
 from walop_jax.likelihood import limits, optics
-from walop_jax.likelihood.field_table import Vector, accurate_table, in_batches
+from walop_jax.likelihood.field_table import Vector, accurate_table, details_of, in_batches
 from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
@@ -329,7 +329,8 @@ def slopes_over_field(
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
     table = None
     if len(x) > counts[0] ** 2 and np.all(corners.high > corners.low):
-        table, off = accurate_table(exact, corners, counts, tolerance, error)
+        details = details_of(instrument)
+        table, off = accurate_table(exact, corners, counts, tolerance, error, details=details)
         table = table if off <= tolerance else None
     return exact(x, y) if table is None else table(x, y)
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -61,8 +61,8 @@ def classes_of(
 
 def _additions(
     fit: FitResult, context: Context, names: Collection[str], groups: Sequence[str]
-) -> Iterator[tuple[str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
-    """Name, positions among the free parameters, change of the data rows without it, its amplitudes in sentences."""
+) -> Iterator[tuple[str, str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
+    """Effect, name, positions among the free parameters, change of the data rows without it, its amplitudes."""
     model = fit.model
     place = {int(i): k for k, i in enumerate(model.free)}
     slope: Matrix | None = None
@@ -73,7 +73,8 @@ def _additions(
             at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
             if at:
                 change = signature(fit, effect.name, context)
-                yield effect.name, np.array(at), change, tuple(map(tuple, effect.first_order(model.template)))
+                sums = tuple(map(tuple, effect.first_order(model.template)))
+                yield effect.name, effect.name, np.array(at), change, sums
             continue
         for group in _groups(effect, groups):
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
@@ -82,7 +83,8 @@ def _additions(
                 continue
             slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
             change = -slope[:, at] @ fit.values[model.free[at]]
-            yield "; ".join(group), np.array(at), change, tuple(((1.0, Sentence.parsed(t)),) for t in group)
+            sums = tuple(((1.0, Sentence.parsed(text)),) for text in group)
+            yield effect.name, "; ".join(group), np.array(at), change, sums
 
 
 def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, ...]]:
@@ -99,11 +101,11 @@ def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, ...
 class Laid:
     """An examination laid out for one linear step from model to model.
 
-    `alike` are effects and groups reported as indistinguishable from additions: with large residuals, where one linear
-    step is inaccurate, they count as probable, if their amplitudes are: at most `largest` prior widths.
+    `alike` are, by added effect, effects and groups reported as indistinguishable from it: with large residuals, where
+    one linear step is inaccurate, they count as probable, if their amplitudes are: at most `largest` prior widths.
     """
 
-    def __init__(self, state: Examination, alike: Collection[str]) -> None:
+    def __init__(self, state: Examination, alike: Mapping[str, Collection[str]]) -> None:
         self.alike = alike
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
@@ -139,13 +141,17 @@ class Laid:
         """The linear step from the fit to the same model with further amplitudes."""
         return LinearStep(self, np.zeros(0, int), np.zeros(self.design.rows))
 
-    def class_of(self, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]) -> ClassOf:
-        """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`."""
+    def class_of(
+        self, effect: str, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]
+    ) -> ClassOf:
+        """Class of the addition of an effect with the amplitudes `at`; without it the residuals change by `lost`."""
         step = LinearStep(self, at, lost)
         addition = step.addition(name, sums)
         # The addition is among the candidates: it is no further member.
         rivals = (
-            member for member in step.candidates(addition.evidence) if _texts(member.sums) != _texts(sums)
+            member
+            for member in step.candidates(addition.evidence, self.alike.get(effect, ()))
+            if _texts(member.sums) != _texts(sums)
         )
         members = [addition, *rivals]
         members += [twin for member in members if (twin := step.in_other_kinds(member)) is not None]
@@ -219,8 +225,8 @@ class LinearStep:
             np.zeros_like(self.laid.matrix),
         )  # fmt: skip
 
-    def candidates(self, of_addition: float) -> Iterator[Likeness]:
-        """Candidates not improbable relative to the addition, the most probable first."""
+    def candidates(self, of_addition: float, alike: Collection[str]) -> Iterator[Likeness]:
+        """Candidates not improbable relative to the addition, the most probable first; `alike` as in `Laid`."""
         state, design = self.laid.state, self.laid.design
         projected = self.projector(design.jacobian[:, self.at])
         basis = projected @ whitening(projected.T @ projected)
@@ -230,7 +236,7 @@ class LinearStep:
         for probe in state.asked:
             at = places[probe.name]
             evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
-            if {probe.name, probe.effect.name} & set(self.laid.alike):
+            if {probe.name, probe.effect.name} & set(alike):
                 square = gram[at, at] + np.diag(probe.widths**-2.0)
                 if np.abs(np.linalg.solve(square, scores[at]) / probe.widths).max() <= self.laid.largest:
                     evidence = max(evidence, of_addition)

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -68,7 +68,7 @@ def ambiguities(
     context: Context,
     names: Collection[str],
     groups: Sequence[str],
-    alike: Collection[str] = (),
+    alike: Mapping[str, Collection[str]] | None = None,
 ) -> Classes:
     """Classes of the effects of a model that have some names, shapes of its descriptions, and undetected changes.
 
@@ -76,7 +76,7 @@ def ambiguities(
     """
     if not state.result.model.template.cameras.pairs:
         return Classes()
-    laid = Laid(state, alike)
+    laid = Laid(state, alike or {})
     return Classes(
         additions=classes_of(laid, context, names, groups),
         shape=shape_of(laid) if names else None,

@@ -120,7 +120,7 @@ def diagnose(
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
-    alike = {name for step in steps for name in (*step.equivalent, *step.nameless)} - {Described.name}
+    alike = {step.effect: {*step.equivalent, *step.nameless} - {Described.name} for step in steps}
     groups = [name for step in state.steps for name in step.groups]
     diagnosis = Diagnosis(
         verdict=verdict,

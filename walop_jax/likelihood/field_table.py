@@ -87,18 +87,28 @@ def _terms(count: int, total: bool) -> tuple[Int[np.ndarray, " t"], Int[np.ndarr
     return i[included], j[included]
 
 
-def held_out(rectangle: Rectangle) -> tuple[Vector, Vector]:
+def held_out(rectangle: Rectangle, details: Sequence[tuple[float, float]] = ()) -> tuple[Vector, Vector]:
     """Places at which a table is checked: the corners, the middles of the sides, and a spread of others.
 
     The others follow the sequence of Roberts 2018 (multiples of 1/φ and 1/φ², φ³ = φ + 1), which falls on no grid.
+    `details` inside the rectangle take the place of the last: what is finer than these places lies there.
     """
     corners = [(a, b) for a in (0.0, 0.5, 1.0) for b in (0.0, 0.5, 1.0)]
     plastic = 1.324717957244746
     number = np.arange(1, limits.CHECKED_PLACES - len(corners) + 1)[:, None]
     unit = np.concatenate([corners, np.mod(number * np.array([1 / plastic, 1 / plastic**2]), 1.0)])
     low, high = np.asarray(rectangle.low), np.asarray(rectangle.high)
-    x, y = (low + unit * (high - low)).T
+    places = low + unit * (high - low)
+    inside = [place for place in details if np.all((low <= place) & (place <= high))]
+    if inside:
+        places[-len(inside) :] = inside[-len(places) :]
+    x, y = places.T
     return x, y
+
+
+def details_of(instrument: Instrument) -> list[tuple[float, float]]:
+    """Field positions (deg) of the local features of the effects of an instrument."""
+    return [place for effect in instrument.effects for place in effect.details()]
 
 
 def accurate_table(
@@ -110,14 +120,16 @@ def accurate_table(
     *,
     truth: Tree | None = None,
     total: bool = False,
+    details: Sequence[tuple[float, float]] = (),
 ) -> tuple[FieldTable | None, float]:
     """The smallest table that is accurate where it has no node, and its error there.
 
     `exact` gives the functions at field positions (deg); `counts` are tried in turn. `error` compares what a table
-    gives at the places of `held_out` with `truth` there (None: what `exact` gives). None where no number of nodes is
-    enough. An error that is not finite ends the search: functions that are not finite somewhere make such a table.
+    gives at the places of `held_out`, `details` among them, with `truth` there (None: what `exact` gives). None where
+    no number of nodes is enough. An error that is not finite ends the search: functions that are not finite somewhere
+    make such a table.
     """
-    other_x, other_y = held_out(rectangle)
+    other_x, other_y = held_out(rectangle, details)
     off = np.inf
     for count in counts:
         x, y = chebyshev.grid(rectangle, count)
@@ -186,5 +198,6 @@ def accurate_nodes(
 
     exact, counts = functools.partial(solved_optics, instrument, plan), limits.NODES_PER_SIDE
     counts = [count for count in counts if count >= (first or 0)]
-    table, off = accurate_table(exact, rectangle, counts, TOLERANCE, error)
+    details = details_of(instrument)
+    table, off = accurate_table(exact, rectangle, counts, TOLERANCE, error, details=details)
     return jax.tree.map(array, table), off

@@ -43,7 +43,7 @@ from walop_jax.data.merge import frames_among, without_frames
 from walop_jax.data.records import Block
 from walop_jax.data.table_intensities import NEGATIVE
 from walop_jax.likelihood import engine, limits
-from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, in_batches
+from walop_jax.likelihood.field_table import TOLERANCE, FieldTable, accurate_table, details_of, in_batches
 from walop_jax.likelihood.likelihood import Census, DataTerms, Expansion, Likelihood, Matrix, OpticsUsed
 from walop_jax.model import chebyshev, light
 from walop_jax.model.chebyshev import Rectangle
@@ -237,6 +237,15 @@ class Cells:
         j = (t + 1.0) * 0.5 * self.grid.height + 0.5 - self.grid.reference[1]
         return self.grid.value[0] + (a * i + b * j), self.grid.value[1] + (c * i + d * j)
 
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Place in the frame of field coordinates (deg): the inverse of `field`."""
+        i, j = (
+            np.linalg.solve(self.grid.matrix, np.subtract((x, y), self.grid.value))
+            + self.grid.reference
+            - 0.5
+        )
+        return float(2.0 * i / self.grid.width - 1.0), float(2.0 * j / self.grid.height - 1.0)
+
 
 class Smooth(NamedTuple):
     """Smooth quantities of the frame: counts for light of unit flux, analysis vectors, Stokes vectors."""
@@ -421,7 +430,8 @@ def _series(
         chosen = ((s.unit[..., exposures], s.vectors, s.stokes[:, exposures]) for s in (interpolated, truth))
         return float(np.max([np.abs(a - b).max() for a, b in zip(*chosen, strict=True)]))
 
-    return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error)
+    details = [cells.place(x, y) for x, y in details_of(instrument)]
+    return accurate_table(exact, FRAME, limits.NODES_PER_SIDE, TOLERANCE, error, details=details)
 
 
 def _assembled(strip_cells: Sequence[CellSums], height: int, every: int) -> CellSums:

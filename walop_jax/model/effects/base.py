@@ -73,6 +73,10 @@ class Effect(Component):
     def patch(self, instrument: Instrument) -> Instrument:
         """The instrument with the effect. Raises `NoSuchPlaceError` where it has no element that the effect acts on."""
 
+    def details(self) -> tuple[tuple[float, float], ...]:
+        """Field positions (deg) that show how fine a local feature is, such as a spot: interpolation may miss it."""
+        return ()
+
     # ---------------------------------------------------------------------------------- making and describing
 
     @classmethod

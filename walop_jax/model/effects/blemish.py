@@ -96,6 +96,11 @@ class Blemish(Effect):
         pattern = _Pattern(float(self.x), float(self.y), float(self.size))
         return (((-1.0, Change("gain", "of", instrument.cameras.names[self.camera], (pattern,))),),)
 
+    def details(self) -> tuple[tuple[float, float], ...]:
+        """The centre, and four places where the spot is steepest."""
+        x, y, size = float(self.x), float(self.y), float(self.size)
+        return tuple((x + a * size, y + b * size) for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)))
+
     def patch(self, instrument: Instrument) -> Instrument:
         """Darken the camera around the spot."""
         names = instrument.cameras.names
