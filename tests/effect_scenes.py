@@ -63,6 +63,7 @@ EVERY_CHANGE = (
     "fringes of half1.plate * gap 2.5",
     "shift of band",
     "rotator of sky",
+    "degree of standard",
     "extinction of polariser",
     "ellipticity of polariser",
     "axis of half2.plate",

@@ -144,6 +144,7 @@ OF_THE_SOURCE = {  # and of the polariser: no part of what is said of the instru
     "standard_colour": {"source": "q", "q": 0.02},
     "standard_drift": {"source": "q", "q": 0.02},
     "standard_angles": {"angle": 1.0},
+    "standard_degrees": {"share": 0.05},
     "clp_zero": {"angle": 1.0},
     "clp_wobble": {"amplitude": 0.3, "phase": 0.4},
     "clp_extinction": {"ratio": 0.01},

@@ -22,7 +22,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.sources import Sight, Standards, mean_over_band
-from walop_jax.model.specification import effect_context
+from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values
 
@@ -160,13 +160,13 @@ def test_the_slope_inside_a_band_is_in_the_counts():
     assert np.abs(modelled - exact).max() < 0.1 * np.abs(without - exact).max()
 
 
-@pytest.mark.parametrize("name", ["standard_colour", "standard_drift", "standard_angles"])
+@pytest.mark.parametrize("name", ["standard_colour", "standard_drift", "standard_angles", "standard_degrees"])
 def test_columns_of_what_standards_may_do(name):
     """Columns from slots against the derivative of the whole light path, for stars with a colour in two filters."""
     run = simulate(BOTH, seed=3)
     model = base_model(run.calset, throughput_degree=1)
     context = effect_context(model.template, run.calset.exposures)
-    effect = effect_by_name(name).probes(context)[1 if name != "standard_angles" else 0][0]
+    effect = effect_by_name(name).probes(context)[0 if name.endswith("s") else 1][0]
     likelihood, values = Likelihood.of(run.calset, model), model.start
     changes = effect.first_order(model.template)
     found = columns(likelihood, values, changes)
@@ -174,6 +174,27 @@ def test_columns_of_what_standards_may_do(name):
     assert np.abs(exact).max() > 0.0
     # A star's slope inside a band is left out of the columns.
     np.testing.assert_allclose(found, exact, atol=2e-3 * np.abs(exact).max())
+
+
+def test_degrees_of_all_standards_are_those_of_another_catalogue():
+    """Counts of the same stars with Stokes parameters that are larger by 5 %; nothing else changes."""
+    run = simulate(BOTH, seed=3)
+    model = base_model(run.calset, throughput_degree=1)
+    larger = with_effects(
+        model, [effect_by_name("standard_degrees").of(BOTH.context(), share=0.05)], run.calset
+    )
+    values = model.start.copy()
+    scaled = [n for n in model.names if n.startswith("standard.") and n.endswith((".q", ".u"))]
+    assert scaled
+    for name in scaled:
+        values[model.index(name)] *= 1.05
+    here, there = (Likelihood.of(run.calset, m) for m in (model, larger))
+    at = [larger.index(name) for name in model.names]
+    start = larger.start
+    start[at] = model.start
+    changed = here.residuals(values)[1]
+    np.testing.assert_allclose(there.residuals(start)[1], changed, atol=1e-9)
+    assert np.abs(changed - here.residuals(model.start)[1]).max() > 1.0
 
 
 def test_two_files_with_a_value_each():

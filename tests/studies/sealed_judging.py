@@ -93,7 +93,7 @@ def homes_of(where: str, law: str) -> set[str]:
     """The places at which what is hidden may be said to be: those that its law over the exposures cannot tell apart."""
     if where.startswith("tables"):
         places = {
-            "catalogue": "standards",
+            "standards": "standards",
             "band": "band",
             "angle": "polariser",
             "rotator": "ahead of polariser",

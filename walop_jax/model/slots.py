@@ -327,7 +327,7 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     if any(isinstance(source, MoonSky) for source in instrument.sources):
         slots += [(kind, "of", SKY) for kind in OF_SOURCES]
     if instrument.standard.names:
-        slots += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator")]
+        slots += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator", "degree")]
     if polariser is not None:
         slots += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
         slots += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]

@@ -190,6 +190,7 @@ class Standards(Source):
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
     angle: Scalar | None = number("deg", "added to all position angles", default=None)
+    share: Scalar | None = number("", "share by which all degrees of polarisation are larger", default=None)
     changes: tuple[Any, ...] = ()  # `effects.numbers.GrownStandard`
 
     name: ClassVar[str] = "standard"
@@ -266,6 +267,8 @@ class Standards(Source):
             qu = qu.at[:, change.axis].add(
                 jnp.where(row == change.value, change.size * change.factor(sight.exposures), 0.0)
             )
+        if self.share is not None:
+            qu = (1.0 + self.share) * qu
         if self.angle is not None:
             rotator = rotator - jnp.deg2rad(self.angle)
         if colour is None or not self.bands:

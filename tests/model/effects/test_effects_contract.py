@@ -49,6 +49,7 @@ CONTRACT = {
     "standard_colour": {"source": None, "q": "", "u": ""},
     "standard_drift": {"source": None, "q": "1/h", "u": "1/h"},
     "standard_angles": {"angle": "deg"},
+    "standard_degrees": {"share": ""},
 }
 every_effect = pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
 # Standards of the scene are seen once each, in one filter: what changes them is in tests/model/test_standards.py.

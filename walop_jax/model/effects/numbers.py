@@ -35,6 +35,7 @@ OF_SOURCES = (*OF_QU, "polarisation")
 PLACES = {
     "shift": {BAND: ("", "filter_shift")},
     "rotator": {SKY: ("", "rotator_zero"), Standards.name: (Standards.name, "angle")},
+    "degree": {Standards.name: (Standards.name, "share")},
 }
 """Places of numbers of the instrument as a whole: their part, and its field."""
 
@@ -165,6 +166,7 @@ KINDS["shift"] = Kind(
     "wavelength", _of_instrument, test=_OF_BAND, grows=lambda *_: _ALONE, slots=itself("whole")
 )
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
+KINDS["degree"] = Kind("share", _of_instrument, test="standards of another catalogue", slots=itself("light"))
 KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
 KINDS |= {
