@@ -39,8 +39,9 @@ from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.effects.change import AMPLITUDES, KINDS, patched
+from walop_jax.model.effects.change import KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.specification import effect_context
 
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
@@ -110,6 +111,7 @@ class Laid:
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
         self.template = model.template
+        self.context = effect_context(self.template, calset.exposures)
         self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
         self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
@@ -280,7 +282,7 @@ class LinearStep:
             for amplitude in member.sums
         )
         column = design.stacked([self.laid.columns.of(sums)])
-        widths = np.array([AMPLITUDES[amplitude[0][1].parameter].width for amplitude in sums])
+        widths = np.array([amplitude[0][1].width(self.laid.context.largest) for amplitude in sums])
         name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
         twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.

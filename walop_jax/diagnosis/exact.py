@@ -39,7 +39,7 @@ from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import Model, model_without, with_effects
+from walop_jax.model.specification import Model, effect_context, model_without, with_effects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,11 +222,13 @@ def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], n
 def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
-    declared = {f"{name}.{leaf.name}": leaf.width for leaf in leaves(effect)}
+    context = effect_context(result.model.template, result.calset.exposures)
+    labels = [f"{name}.{label}" for field in effect.kind.amplitudes() for label in effect.labels(field)]
+    expected = dict(zip(labels, effect.prior_widths(context).tolist(), strict=True))
     far = {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]
-        widths = abs(float(result.values[i]) - p.prior[0]) / (declared[p.name] or np.inf)  # type: ignore[index]
+        widths = abs(float(result.values[i]) - p.prior[0]) / expected[p.name]  # type: ignore[index]
         if widths > PRIOR_EDGE:
             far[p.name.removeprefix(f"{name}.")] = widths
     return far

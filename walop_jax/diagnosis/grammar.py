@@ -49,10 +49,10 @@ def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tupl
     """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
     groups = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
     texts = ([sentence.text for sentence in group] for group in sorted(groups, key=len))
-    bare = Context()
+    context = effect_context(instrument, exposures)
     return tuple(
-        Probe("; ".join(group), Described, tuple(Described.of(bare, sentences=(text,)) for text in group))
-        for group in texts
+        Probe("; ".join(t), Described, tuple(Described.of(context, sentences=(text,)) for text in t), context)
+        for t in texts
     )
 
 
@@ -60,7 +60,8 @@ def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
     """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits."""
-    context, all_probes = effect_context(instrument, exposures), sentences(instrument, exposures, points)
+    context = effect_context(instrument, exposures)
+    all_probes = sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
     alone, partial = beside_names(all_probes, effects, context, instrument)
     return Hypotheses(tuple(probes(effects, context)), alone, partial, effects, all_probes)

@@ -26,17 +26,20 @@ from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS
 
-DEFAULT_WIDTH = 1.0
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """One group of probes of an effect: the place in its shape space from which a linear step is taken."""
+    """One group of probes of an effect: the place in its shape space from which a linear step is taken.
+
+    `context` are the data that its prior widths are for.
+    """
 
     name: str
     effect: EffectKind
     group: tuple[Effect, ...]
+    context: Context = dataclasses.field(default_factory=Context)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -47,8 +50,7 @@ class Probe:
     @functools.cached_property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
-        declared = self.effect.numbers()
-        return np.array([declared[name].width or DEFAULT_WIDTH for name in self.parameters])
+        return np.concatenate([member.prior_widths(self.context) for member in self.group])
 
     @property
     def one_sided(self) -> Bool[np.ndarray, " _"]:
@@ -105,7 +107,9 @@ def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]
             continue
         groups = effect.probes(context)
         for number, group in enumerate(groups):
-            probe = Probe(effect.name if len(groups) == 1 else f"{effect.name}#{number}", effect, group)
+            probe = Probe(
+                effect.name if len(groups) == 1 else f"{effect.name}#{number}", effect, group, context
+            )
             if len(probe.widths):
                 yield probe
 

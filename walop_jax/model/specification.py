@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -21,9 +22,11 @@ from walop_jax.model.compiled import array
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects import EFFECTS, Described, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context, Effect
+from walop_jax.model.effects.factors import largest_factors
 from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
+from walop_jax.model.planning import hours_of
 
 Vector = Float[np.ndarray, " n"]
 THROUGHPUT = "throughput"
@@ -241,8 +244,11 @@ def make_model(
 
 
 def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
-    """Facts about a data set for effects: its Moon exposures, its standards, its number of exposures."""
-    moon = np.flatnonzero(exposures.direct("moon"))
+    """Facts about a data set for effects: its Moon exposures, its standards, its exposures and their conditions."""
+    moon, e = np.flatnonzero(exposures.direct("moon")), exposures
+    at = SimpleNamespace(
+        hours=hours_of(e), hour_angle=e.ha, temperature=e.temp, exptime=e.exptime, number=np.arange(len(e))
+    )
     return Context(
         exposures=len(exposures),
         moon=tuple(moon.tolist()),
@@ -251,6 +257,7 @@ def effect_context(instrument: Instrument, exposures: Exposures) -> Context:
         cameras=instrument.cameras.names,
         extinction=float(polariser.extinction) if (polariser := instrument.polariser) else EXTINCTION,
         units=instrument.units,
+        largest=largest_factors(at, instrument.units),
     )
 
 
@@ -268,7 +275,7 @@ def with_effects(
     """
     context = data if isinstance(data, Context) else effect_context(model.template, data.exposures)
     active = list(model.template.effects)
-    starts = {}
+    starts, widths = {}, dict[str, float]()
     for effect in effects:
         if not isinstance(effect, Effect):
             kind = effect_by_name(effect, model.catalogue) if isinstance(effect, str) else effect
@@ -280,6 +287,9 @@ def with_effects(
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
+        fields = effect.kind.amplitudes()
+        labels = [f"{effect.name}.{label}" for field in fields for label in effect.labels(field)]
+        widths |= dict(zip(labels, effect.prior_widths(context).tolist(), strict=True))
     sentences = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
     for effect in active:
         for text in sentences.intersection(effect.stated):
@@ -294,7 +304,7 @@ def with_effects(
     for p in make_model(model.name, instrument).parameters:
         if p.name in starts:
             start, neutral = map(float, starts[p.name])
-            prior = None if p.prior is None else (neutral, p.prior[1])
+            prior = None if p.prior is None else (neutral, widths.get(p.name, p.prior[1]))
             by_name[p.name] = dataclasses.replace(p, start=start, prior=prior)
         parameters.append(by_name[p.name])
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))

@@ -13,7 +13,7 @@ import pytest
 
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.io.errors import DataError
-from walop_jax.model.effects import EFFECTS, effect_by_name
+from walop_jax.model.effects import EFFECTS, Described, effect_by_name
 from walop_jax.model.effects.catalogue import catalogue_with
 from walop_jax.model.specification import effect_context, make_model, with_effects
 
@@ -65,7 +65,26 @@ def test_wrong_names_and_effects_twice_are_errors():
 
 def test_context_of_a_data_set():
     context = effect_context(MODEL.template, scenes.EXPOSURES)
-    assert context == scenes.CONTEXT
+    assert context._replace(largest={}) == scenes.CONTEXT._replace(largest={})
+
+
+def test_prior_widths_are_those_of_the_largest_values_of_factors():
+    """Nine exposures of 30 s in 3.6 h, up to 16 °C, hour angles to 2 h: 0.3 % of light at the end, not in an hour."""
+    context = effect_context(MODEL.template, scenes.EXPOSURES)
+    expected = {"hours": 3.6, "hour angle": 2.0, "kelvin": 6.0, "per EXPTIME": 1.0 / 30.0, "order": 8.0}
+    assert {name: context.largest[name] for name in expected} == pytest.approx(expected)
+    for factors, size in (
+        ("", 1.0),
+        (" * hours", 3.6),
+        (" * per EXPTIME", 1.0 / 30.0),
+        (" * x * kelvin", 6.0),
+    ):
+        text = f"gain of O1{factors}"
+        width = 0.003 / size
+        assert Described.saying([text], [0.0]).prior_widths(context) == pytest.approx([width])
+        model = with_effects(MODEL, [Described.saying([text], [0.0])], context)
+        (prior,) = (p.prior for p in model.parameters if p.name == f"described.{text.replace(' ', '_')}")
+        assert prior == pytest.approx((0.0, width))
 
 
 # ---------------------------------------------------------------------------------- effects of one's own

@@ -11,6 +11,7 @@ import dataclasses
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -32,7 +33,8 @@ class Context(NamedTuple):
 
     `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
     names of the standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is
-    that of the polariser without the effect, `units` the scales of field and wavelength.
+    that of the polariser without the effect, `units` the scales of field and wavelength. `largest` are the largest
+    values of factors of changes (`factors.largest_factors`); what is not there is at most about 1.
     """
 
     exposures: int = 0
@@ -42,6 +44,7 @@ class Context(NamedTuple):
     cameras: tuple[str, ...] = CAMERAS
     extinction: float = EXTINCTION
     units: Units = OF_WALOP
+    largest: Mapping[str, float] = MappingProxyType({})
 
 
 class Effect(Component):
@@ -155,6 +158,14 @@ class Effect(Component):
         if "camera" in values:
             values["camera"] = numbered_camera(self.name, values["camera"], context.cameras)
         return self.replaced(**values)
+
+    def prior_widths(self, context: Context) -> Float[np.ndarray, " a"]:
+        """Prior widths of the amplitudes for some data, in the order of its parameters."""
+        declared = self.declarations()
+        widths = (
+            np.full(np.size(getattr(self, n)), declared[n].width or 1.0) for n in self.kind.amplitudes()
+        )
+        return np.concatenate([np.zeros(0), *widths])
 
     def moved(self, amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """The effect with numbers added to its amplitudes, in the order of its parameters."""

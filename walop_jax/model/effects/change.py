@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import operator
 import re
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
@@ -194,6 +195,11 @@ class Change:
     def times(self, *factors: str) -> Change:
         """The change with further factors."""
         return dataclasses.replace(self, factors=(*self.factors, *factors))
+
+    def width(self, largest: Mapping[str, float]) -> float:
+        """Prior width of the amplitude: the change is as large as that where its factors are largest (`Context`)."""
+        sizes = (largest.get(item.text, 1.0) for item in self.grows_with)
+        return AMPLITUDES[self.parameter].width / math.prod(sizes)
 
     @property
     def number(self) -> int:

@@ -187,6 +187,17 @@ PLAIN: Mapping[str, Factor] = {
 """Factors without a number of their own, by text."""
 
 
+WIDE = 0.1  # of the mean wavelength: half the width of a broad band
+
+
+def largest_factors(at: Any, units: Units) -> dict[str, float]:
+    """Largest absolute values of the factors that grow with a condition of the exposures `at`, by text."""
+    growing = (item for item in PLAIN.values() if item.depends_on == EXPOSURE)
+    values = {item.text: np.nan_to_num(np.asarray(item.value(at, units), float)) for item in growing}
+    largest = {text: float(np.abs(value).max(initial=0.0)) for text, value in values.items()}
+    return {text: size for text, size in largest.items() if size > 0.0} | {"colour": WIDE}
+
+
 @functools.cache
 def factor(text: str) -> Factor:
     """The factor of a text. Raises ValueError, with the nearest ones, for an unknown text."""
