@@ -166,6 +166,10 @@ def test_grammar_of_another_instrument():
     assert "retardance q behind window; retardance u behind window" in said
     assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said
     assert "axis of main.plate.second" in said
+    # What turns with an element, and what does not: both may be anything that acts on polarisation.
+    kinds = [f"{what} {axis}" for what in ("diattenuation", "retardance", "depolarisation") for axis in "quv"]
+    for place in ("behind window", "of window", "of polariser"):
+        assert "; ".join(f"{kind} {place} * r2" for kind in kinds) in said
     assert "light of left in right" in said
     assert not any("half1" in name or "O1" in name or "ahead of" in name for name in said)
 

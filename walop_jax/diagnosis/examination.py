@@ -387,13 +387,11 @@ def examine(
     `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    inactive = [probe for probe in hypotheses.names if probe.effect.name not in active]
-    listed = [*hypotheses.sentences, *(probe for probe, _ in hypotheses.parts)]
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
-        computed = all_candidates(design.columns, [*inactive, *listed])
-    probes = [probe for probe in inactive if probe.name in computed]
+        computed = all_candidates(design.columns, hypotheses.beside(active))
+    probes = [p for p in hypotheses.names if p.name in computed and p.effect.name not in active]
     sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
     holders = [(p, {kind for kind in kinds if kind.name not in active}) for p, kinds in hypotheses.parts]
     parts = [(probe, kinds) for probe, kinds in holders if probe.name in computed]

@@ -170,8 +170,12 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
     moving = {element.moves: element for element in instrument.train() if element.moves}
     turning = [prefix for prefix in moving if exposures.position(prefix).inside.any()]
     for prefix in turning:
-        for group in (("turn",), *groups):
-            bases = {"alone": [_base(group, "of", moving[prefix].name)]}
+        place = "of", moving[prefix].name
+        for number, group in enumerate((*groups, ("turn",))):
+            bases = {
+                "alone": [_base(group, *place)],
+                "anything": [] if number else [_base(GENERATORS, *place)],
+            }
             yield Subject(bases, (prefix,), exposures.position(prefix).inside)
     yield from _of_plates(instrument, exposures)
     yield from _of_cameras(instrument, exposures, tuple(turning), over_field=over_field)

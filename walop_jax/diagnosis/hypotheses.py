@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +86,11 @@ class Hypotheses(NamedTuple):
     parts: Sequence[tuple[Probe, frozenset[EffectKind]]] = ()
     effects: tuple[EffectKind, ...] = ()
     every: Sequence[Probe] = ()
+
+    def beside(self, effects: Collection[str]) -> tuple[Probe, ...]:
+        """All candidates beside the effects that a model has."""
+        absent = (probe for probe in self.names if probe.effect.name not in effects)
+        return (*absent, *self.sentences, *(probe for probe, _ in self.parts))
 
     @property
     def amplitudes(self) -> int:

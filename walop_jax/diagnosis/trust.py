@@ -143,8 +143,7 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     """
     fit, calset, basis, count = design.fit, design.fit.calset, design.projector.basis, design.rows
     listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
-    absent = [probe for probe in listed.names if probe.effect.name not in fit.model.effect_names]
-    probes = (*absent, *listed.sentences, *(probe for probe, _ in listed.parts))
+    probes = listed.beside(fit.model.effect_names)
     known = {
         r.candidate.name: r.candidate.columns[:count] for r in (singles.rivals if singles else ()) if r.probe
     }

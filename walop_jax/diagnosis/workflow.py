@@ -180,7 +180,7 @@ def _examined(
 def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict[str, str]:
     """Everything that was not scored, by name, each with the reason."""
     probed = {probe.effect for probe in candidates.names}
-    scored = {probe.name for probe in (*candidates.sentences, *(probe for probe, _ in candidates.parts))}
+    scored = {probe.name for probe in candidates.beside(())}
     absent = [kind.name for kind in catalogue if kind not in candidates.effects]
     reasons = dict.fromkeys(absent, "the instrument has nothing that it acts on")
     for effect in candidates.effects:

@@ -210,18 +210,19 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
     always = Combinations(over, ("steady", *SLOW))
     if _is_ahead(instrument, change):
-        return Grows((FIELD, EXPOSURE), None, (always, Combinations(along=(*SINGLE, "kind")), _ANYTHING))
+        single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
+        return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
     if change.where != "of":
         further = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
         return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
-        film = always, Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
+        waves, single = Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
+        film = always, waves, single, _ANYTHING
         as_a_turn = {"turn": _TURN, "retardance v": ()}
         return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
-    tried = (
-        Combinations(along=("step", "spell")) if kind == "turn" else Combinations(over, ("harmonics to 2",))
-    )
-    return Grows((FIELD, WAVELENGTH, EXPOSURE), instrument.element(change.place).moves or "", (tried,))
+    moves, waves = instrument.element(change.place).moves or "", Combinations(over, ("harmonics to 2",))
+    tried = (Combinations(along=("step", "spell")),) if kind == "turn" else (waves, _ANYTHING)
+    return Grows((FIELD, WAVELENGTH, EXPOSURE), moves, tried)
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
