@@ -38,7 +38,7 @@ def told() -> tuple[FitResult, Context, Any]:
         if probe.name.startswith("gain of")
     ]
     state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    return result, context, ambiguities(state, context, {Described.name}, [TOLD])
+    return result, context, ambiguities(state, context, {TOLD: ()})
 
 
 @functools.cache

@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2180,
     "science": 5809,
-    "diagnosis": 7884,
+    "diagnosis": 7898,
     "nights": 2682,
     "plans": 2222,
     "paper": 775,

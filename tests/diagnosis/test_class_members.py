@@ -106,7 +106,7 @@ def test_what_was_added_is_in_its_class_once():
         if probe.name in (own, other)
     ]
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(sentences=said), np.random.default_rng(0))
-    (found,) = ambiguities(state, context, {Described.name}, [own]).additions
+    (found,) = ambiguities(state, context, {own: ()}).additions
     assert [member.name for member in found.members] == [own, other]
 
 
@@ -125,7 +125,7 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     assert len(said) == 2
     result = fit(Likelihood.of(calset, model))
     state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    classes = ambiguities(state, context, {Described.name}, [leak], alike={Described.name: [rival]})
+    classes = ambiguities(state, context, {leak: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
     alone = Calibration.from_fit(result.judged())
     product = averaged(alone, classes, context)
@@ -143,7 +143,7 @@ def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_anot
     asked = grammar.sentences(result.model.template, calset.exposures, len(calset.points))
     probes = Hypotheses(sentences=[probe for probe in asked if probe.name == rival])
     state = examine(result, probes, np.random.default_rng(0))
-    classes = ambiguities(state, context, {"blemish"}, [], alike={"lens_birefringence": [rival]})
+    classes = ambiguities(state, context, {"blemish": (), "lens_birefringence": [rival]})
     assert classes.additions == ()
 
 
@@ -159,9 +159,7 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
         if probe.name == "gain of O1 * hours"
     ]
     state = examine(result, Hypotheses(sentences=rivals), np.random.default_rng(0))
-    (spots,) = ambiguities(
-        state, context, {"blemish"}, [], alike={"blemish": [p.name for p in rivals]}
-    ).additions
+    (spots,) = ambiguities(state, context, {"blemish": [p.name for p in rivals]}).additions
     assert spots.members[0].probability >= spots.members[1].probability
     product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)), context)
     values = dict(zip(product.model.names, product.values, strict=True))

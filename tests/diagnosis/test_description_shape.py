@@ -40,7 +40,7 @@ def described():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([TEXT], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    return state, context, ambiguities(state, context, {Described.name}, [TEXT])._replace(undetected=None)
+    return state, context, ambiguities(state, context, {TEXT: ()})._replace(undetected=None)
 
 
 def test_patterns_are_all_polynomials_to_the_third_degree():
@@ -143,9 +143,7 @@ def test_a_hidden_deviation_is_in_the_errors():
         )
         for t in ([TEXT], [TEXT, other])
     )
-    shape = ambiguities(
-        examine(one, Hypotheses(), np.random.default_rng(0)), context, {Described.name}, [TEXT]
-    ).shape
+    shape = ambiguities(examine(one, Hypotheses(), np.random.default_rng(0)), context, {TEXT: ()}).shape
     j = [change.text for change in shape.changes].index(other)
     exact = both.values[both.model.index(f"described.{other.replace(' ', '_')}")]
     assert exact == pytest.approx(-1.5e-3, rel=0.3)
@@ -219,7 +217,7 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    classes = ambiguities(state, context, {Described.name}, [text])
+    classes = ambiguities(state, context, {text: ()})
     assert classes.shape.on_stars == ()
     alone = classes._replace(additions=(), undetected=None)
     product = averaged(Calibration.from_fit(state.result.judged()), alone, context)
@@ -235,7 +233,7 @@ def test_deviations_of_sky_light_may_depend_on_the_temperature():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    classes = ambiguities(state, context, {Described.name}, [text])
+    classes = ambiguities(state, context, {text: ()})
     laws = {change.beside_field for change in classes.shape.changes}
     assert ("kelvin",) in laws
     product = averaged(Calibration.from_fit(state.result.judged()), classes, context)

@@ -39,7 +39,7 @@ def fitted(seed: int, *texts: str, size: float = SIZE):
     simulation = simulate(SMALL, seed=seed, effects=effects)
     result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
     context = effect_context(result.model.template, result.calset.exposures)
-    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), context, set(), [])
+    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), context, {})
     assert not classes.several
     return result, classes.undetected, simulation
 
@@ -128,7 +128,7 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
     asked = grammar.sentences(result.model.template, result.calset.exposures, len(result.calset.points))
     (probe,) = (probe for probe in asked if probe.name == drift)
     state = examine(result, Hypotheses(sentences=[probe]), np.random.default_rng(0))
-    laid = Laid(state, {})
+    laid = Laid(state)
     root = _of_other_light(laid, LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows)))
     at = state.bare.places()[probe.name]
     square = state.bare.gram[at, at].item()

@@ -48,7 +48,7 @@ def judged(seed: int) -> sealed.Judged:
     every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
     state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
-    classes = ambiguities(state, context, {Described.name}, [TOLD])
+    classes = ambiguities(state, context, {TOLD: ()})
     return sealed.judged(averaged(Calibration.from_fit(result), classes, context), True, one)
 
 

@@ -458,7 +458,7 @@ def _with_undetected(fitted: FitResult) -> Calibration:
     """The calibration of a diagnosis that adds nothing to a fit."""
     context = effect_context(fitted.model.template, fitted.calset.exposures)
     state = examine(fitted, Hypotheses(), np.random.default_rng(0))
-    return Calibration.from_fit(with_average(fitted, ambiguities(state, context, set(), [])))
+    return Calibration.from_fit(with_average(fitted, ambiguities(state, context, {})))
 
 
 def line(number: int, one: Outcome) -> str:

@@ -49,26 +49,30 @@ LINEAR = 0.01  # relative error of the evidence of a linear step
 PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
-def classes_of(
-    laid: Laid, context: Context, names: Collection[str], groups: Sequence[str]
-) -> tuple[ClassOf, ...]:
-    """The classes of the effects of a model that have some names, without those of a single member.
+def classes_of(laid: Laid, context: Context, added: Mapping[str, Collection[str]]) -> tuple[ClassOf, ...]:
+    """The classes of what was added to a model, without those of a single member.
 
-    `groups` are the names of the added groups of sentences.
+    `added` are effects and groups of sentences, by name, each with the candidates reported as indistinguishable from
+    it: with large residuals, where one linear step is inaccurate, these count as probable.
     """
-    classes = itertools.starmap(laid.class_of, _additions(laid.fit, context, names, groups))
+    classes = (
+        laid.class_of(words, at, lost, sums, added.get(name, ()))
+        for name, words, at, lost, sums in _additions(laid.fit, context, added)
+    )
     return tuple(addition for addition in classes if addition.names)
 
 
 def _additions(
-    fit: FitResult, context: Context, names: Collection[str], groups: Sequence[str]
+    fit: FitResult, context: Context, added: Collection[str]
 ) -> Iterator[tuple[str, str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
-    """Effect, name, positions among the free parameters, change of the data rows without it, its amplitudes."""
+    """Name as it was added and as it is in the model, positions among the free parameters, change of the data rows
+    without it, its amplitudes."""
     model = fit.model
+    groups = [name for name in added if name not in model.effect_names]
     place = {int(i): k for k, i in enumerate(model.free)}
     slope: Matrix | None = None
     for effect in model.effects:
-        if effect.kind.is_structural() or effect.name not in names:
+        if effect.kind.is_structural() or not (effect.name in added or isinstance(effect, Described)):
             continue
         if not isinstance(effect, Described):
             at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
@@ -77,7 +81,7 @@ def _additions(
                 sums = tuple(map(tuple, effect.first_order(model.template)))
                 yield effect.name, effect.name, np.array(at), change, sums
             continue
-        for group in _groups(effect, groups):
+        for name, group in _groups(effect, groups) if groups else ():
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
             at = [place[i] for i in indices if i in place]
             if not at:
@@ -85,29 +89,27 @@ def _additions(
             slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
             change = -slope[:, at] @ fit.values[model.free[at]]
             sums = tuple(((1.0, Sentence.parsed(text)),) for text in group)
-            yield effect.name, "; ".join(group), np.array(at), change, sums
+            yield name, "; ".join(group), np.array(at), change, sums
 
 
-def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Sentences of a model in the groups of their addition; each ungrouped sentence is a group of its own."""
+def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Sentences of a model in the groups of their addition, by name; an ungrouped sentence is a group of its own."""
     ungrouped = list(effect.sentences)
     for name in groups:
         group = tuple(text for text in ungrouped if text in name.split("; "))
         ungrouped = [text for text in ungrouped if text not in group]
         if group:
-            yield group
-    yield from ((text,) for text in ungrouped)
+            yield name, group
+    yield from ((text, (text,)) for text in ungrouped)
 
 
 class Laid:
     """An examination laid out for one linear step from model to model.
 
-    `alike` are, by added effect, effects and groups reported as indistinguishable from it: with large residuals, where
-    one linear step is inaccurate, they count as probable, if their amplitudes are: at most `largest` prior widths.
+    No amplitude of a plausible member is more than `largest` prior widths.
     """
 
-    def __init__(self, state: Examination, alike: Mapping[str, Collection[str]]) -> None:
-        self.alike = alike
+    def __init__(self, state: Examination) -> None:
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
         self.template = model.template
@@ -144,15 +146,23 @@ class Laid:
         return LinearStep(self, np.zeros(0, int), np.zeros(self.design.rows))
 
     def class_of(
-        self, effect: str, name: str, at: Int[np.ndarray, " a"], lost: Vector, sums: tuple[Sum, ...]
+        self,
+        name: str,
+        at: Int[np.ndarray, " a"],
+        lost: Vector,
+        sums: tuple[Sum, ...],
+        alike: Collection[str],
     ) -> ClassOf:
-        """Class of the addition of an effect with the amplitudes `at`; without it the residuals change by `lost`."""
+        """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`.
+
+        `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
+        """
         step = LinearStep(self, at, lost)
         addition = step.addition(name, sums)
         # The addition is among the candidates: it is no further member.
         rivals = (
             member
-            for member in step.candidates(addition.evidence, self.alike.get(effect, ()))
+            for member in step.candidates(addition.evidence, alike)
             if _texts(member.sums) != _texts(sums)
         )
         members = [addition, *rivals]
@@ -228,7 +238,7 @@ class LinearStep:
         )  # fmt: skip
 
     def candidates(self, of_addition: float, alike: Collection[str]) -> Iterator[Likeness]:
-        """Candidates not improbable relative to the addition, the most probable first; `alike` as in `Laid`."""
+        """Candidates not improbable relative to the addition, the most probable first; `alike` as in `class_of`."""
         state, design = self.laid.state, self.laid.design
         projected = self.projector(design.jacobian[:, self.at])
         basis = projected @ whitening(projected.T @ projected)

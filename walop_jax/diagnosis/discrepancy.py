@@ -66,20 +66,19 @@ DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in na
 def ambiguities(
     state: Examination,
     context: Context,
-    names: Collection[str],
-    groups: Sequence[str],
-    alike: Mapping[str, Collection[str]] | None = None,
+    added: Mapping[str, Collection[str]],
 ) -> Classes:
-    """Classes of the effects of a model that have some names, shapes of its descriptions, and undetected changes.
+    """Classes of the additions to a model, shapes of its descriptions, and undetected changes.
 
-    `groups` are the names of the added groups of sentences, `alike` those of `class_members.Laid`.
+    `added` are effects and groups of sentences, by name, each with the candidates that are reported as
+    indistinguishable from it (`class_members.classes_of`).
     """
     if not state.result.model.template.cameras.pairs:
         return Classes()
-    laid = Laid(state, alike or {})
+    laid = Laid(state)
     return Classes(
-        additions=classes_of(laid, context, names, groups),
-        shape=shape_of(laid) if names else None,
+        additions=classes_of(laid, context, added),
+        shape=shape_of(laid) if added else None,
         undetected=undetected(laid),
     )
 

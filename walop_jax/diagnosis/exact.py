@@ -51,7 +51,8 @@ class Trial:
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
     where its linear step does not predict held-out data, `compared` holds the comparison of two fits
     (`refits.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
-    which it was not added, `groups` the groups of sentences that were added one after the other.
+    which it was not added, `groups` the groups of sentences that were added one after the other, each with the
+    candidates that were as good then.
     """
 
     effect: EffectKind
@@ -68,7 +69,7 @@ class Trial:
     compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     against: str = ""
     refused: str = ""
-    groups: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:

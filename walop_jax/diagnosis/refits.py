@@ -152,7 +152,8 @@ class Refits:
         assert trial.fit is not None
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
-        compared, groups = dict(trial.compared), (trial.name,) if trial.effect is Described else ()
+        compared, alike = dict(trial.compared), (*trial.rivals, *trial.nameless)
+        groups = {trial.name: alike} if trial.effect is Described else {}
         if result is not trial.fit:
             compared |= before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
@@ -164,7 +165,7 @@ class Refits:
         for earlier in (step for step in state.steps if step.effect is trial.effect):
             before = "chi2_before", "heldout_before", "residual_before"
             compared |= {key: earlier.compared[key] for key in before}
-            groups = (*earlier.groups, *groups)
+            groups = {**earlier.groups, **groups}
         step = dataclasses.replace(trial, compared=compared, groups=groups)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])

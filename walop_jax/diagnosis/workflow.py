@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -120,8 +120,11 @@ def diagnose(
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
-    alike = {step.effect: {*step.equivalent, *step.nameless} - {Described.name} for step in steps}
-    groups = [name for step in state.steps for name in step.groups]
+    alike: dict[str, Collection[str]] = {}
+    for trial, step in zip(state.steps, steps, strict=True):
+        names = tuple(trial.groups) or (step.effect,)
+        alone = {*step.equivalent, *step.nameless} - {Described.name}
+        alike |= {names[0]: alone} if len(names) == 1 else trial.groups
     diagnosis = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -143,7 +146,7 @@ def diagnose(
         ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
-        members=ambiguities(evidence, context, set(added), groups, alike),
+        members=ambiguities(evidence, context, alike),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),
