@@ -190,7 +190,7 @@ class AnalysisVectors:
         return plan, np.asarray(plan.band_of)[:, 0]
 
     def _kept(self, make: Callable[[Settings], OverField], setting: Settings, name: str = "") -> OverField:
-        """The interpolated function of one setting, in the order (colour, camera, Stokes, …), made when asked for."""
+        """The function of one setting, in the order (colour, camera, Stokes, …), made when asked for."""
         key = (name or make.__name__, setting.key)
         if key not in self._tables:
             self._tables[key] = make(setting)

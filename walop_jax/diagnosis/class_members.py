@@ -72,16 +72,13 @@ def _additions(
     place = {int(i): k for k, i in enumerate(model.free)}
     slope: Matrix | None = None
     for effect in model.effects:
-        if effect.kind.is_structural() or not (effect.name in added or isinstance(effect, Described)):
-            continue
-        if not isinstance(effect, Described):
+        if effect.name in added and not effect.kind.is_structural():
             at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
             if at:
                 change = signature(fit, effect.name, context)
                 sums = tuple(map(tuple, effect.first_order(model.template)))
                 yield effect.name, effect.name, np.array(at), change, sums
-            continue
-        for name, group in _groups(effect, groups) if groups else ():
+        for name, group in _groups(effect, groups) if groups and isinstance(effect, Described) else ():
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
             at = [place[i] for i in indices if i in place]
             if not at:

@@ -120,7 +120,9 @@ def diagnose(
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
-    alike: dict[str, Collection[str]] = {}
+    alike: dict[
+        str, Collection[str]
+    ] = {}  # of a single group what the final model cannot separate from it as well
     for trial, step in zip(state.steps, steps, strict=True):
         names = tuple(trial.groups) or (step.effect,)
         alone = {*step.equivalent, *step.nameless} - {Described.name}
