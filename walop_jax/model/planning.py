@@ -107,8 +107,8 @@ def plan_for(
     if instrument.cameras.split or steady.any():
         arrays = _sharing(arrays, exposure_settings, steady, split=instrument.cameras.split)
     slope = np.arange(len(row)) >= last
-    hours, kinds = hours_of(exposures)[row], exposures.kind[row]
-    plan, band = _plan(instrument, settings, hours, filters, arrays, kinds, slope)
+    of_list = {"hours": hours_of(exposures)[row], "exptime": exposures.exptime[row]}
+    plan, band = _plan(instrument, settings, of_list, filters, arrays, exposures.kind[row], slope)
     plan = dataclasses.replace(plan, band_of=band_of(band[:last]))
     if sources is None or not sloping.size:
         return plan
@@ -163,9 +163,10 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
     unknown moving element.
     """
     settings.check_moving(instrument.patched().moving())
-    hours, count = np.zeros(len(settings)), len(settings)
-    blank = blank_exposures(instrument, count)
-    plan, band = _plan(instrument, settings, hours, filters, blank, np.full(count, ""), np.zeros(count, bool))
+    count = len(settings)
+    of_list = {"hours": np.zeros(count), "exptime": np.zeros(count)}
+    blank, kinds, slope = blank_exposures(instrument, count), np.full(count, ""), np.zeros(count, bool)
+    plan, band = _plan(instrument, settings, of_list, filters, blank, kinds, slope)
     return dataclasses.replace(plan, band_of=band[:, None])
 
 
@@ -233,18 +234,22 @@ def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> 
 def _plan(
     instrument: Instrument,
     settings: Settings,
-    hours: Float[np.ndarray, " n"],
+    of_list: Mapping[str, Float[np.ndarray, " n"]],
     filters: Mapping[str, FilterCurve],
     exposures: ExposureArrays,
     kinds: np.ndarray,
     slope: Bool[np.ndarray, " n"],
 ) -> tuple[Plan, Int[np.ndarray, " n"]]:
-    """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes."""
+    """A plan, but for `Plan.band_of`, and the band of every setting; `slope` is true for those of slopes.
+
+    `of_list` are the conditions of exposures that no setting has, which stars do not see: hours and EXPTIME.
+    """
     requirements, patched, count = needs(instrument), instrument.patched(), len(settings)
     moving = patched.moving()
     names = sorted(requirements.conditions)
-    values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, "hours": hours}
+    values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, **of_list}
     assert set(values) == set(CONDITIONS)
+    values |= {f"kind {kind}": (kinds == kind) * 1.0 for kind in instrument.kinds}
     # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
     # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so that a set with another
     # colour for one of them has a plan of the same shape, and the same programs.

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 Real = Float[Array, "..."]
 
-CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD"}
-"""Conditions on which the optics may depend from exposure to exposure (Celsius; hours; hours since the first one), and
-their columns of EXPOSURES."""
+CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD", "exptime": "EXPTIME"}
+"""Conditions on which the optics may depend from exposure to exposure (Celsius; hours; hours since the first one; s),
+and their columns of EXPOSURES. Whether an exposure is of some KIND is one more, for each KIND."""
 
 
 class NotPlannedError(ValueError):
@@ -31,7 +31,7 @@ class NotPlannedError(ValueError):
 
 
 class Conditions(eqx.Module):
-    """Conditions of an exposure at every wavelength node; of `CONDITIONS` only those used by the optics.
+    """Conditions of an exposure at every wavelength node: those that the optics use.
 
     `band_width` is the equivalent width (µm) of the filter of a node.
     """
@@ -42,9 +42,16 @@ class Conditions(eqx.Module):
     def __getattr__(self, name: str) -> Real:
         if name not in CONDITIONS:
             raise AttributeError(name)
-        if name not in self.planned:
-            raise NotPlannedError(name)
-        return self.planned[name]
+        return self._planned(name)
+
+    def of_kind(self, name: str) -> Real:
+        """1 in exposures of a KIND, 0 in others."""
+        return self._planned(f"kind {name}")
+
+    def _planned(self, quantity: str) -> Real:
+        if quantity not in self.planned:
+            raise NotPlannedError(quantity)
+        return self.planned[quantity]
 
 
 class Ray(eqx.Module):

@@ -57,7 +57,7 @@ EVERY_NAME = {name: parameters for *_, (name, parameters) in SAME.values()}
 IN_VAIN = (
     ("axis of half1.plate", "sin 2 CHWP"),  # not an element whose angle it knows
     ("axis of chwp", "exposure 3"),
-    ("retardance q behind collimator", "kind moon"),
+    ("retardance q behind collimator", "order"),
     ("retardance q behind collimator", "cos 2 CLP"),
     ("retardance q behind collimator", "counts"),
     ("turn of polariser", "colour"),
@@ -95,6 +95,27 @@ def test_depolarisation_of_a_stokes_parameter():
 def test_factors_that_would_be_left_out_are_refused(change, factor):
     with pytest.raises(ValueError, match=f"cannot grow with '{factor}'"):
         said(f"{change} * {factor}", values=[0.1]).patch(nominal_instrument())
+
+
+@pytest.mark.parametrize(
+    ("factor", "share"),
+    [
+        ("kind moon", [0, 0, 0, 0, 1, 1, 0, 0, 0]),
+        ("kind standard", [0, 0, 0, 0, 0, 0, 1, 1, 0]),
+        ("per EXPTIME", [1 / 30] * 9),
+        ("hours", [0, 1.2, 1.2, 1.2, 2.4, 2.4, 2.4, 2.4, 2.4]),
+    ],
+)
+def test_optics_follow_the_exposures(factor, share):
+    """An element that depends on the list acts in every exposure as a steady one of that size does."""
+    sentence, size = "retardance q behind collimator", 0.3
+    found = scenes.observe(said(f"{sentence} * {factor}", values=[size]))
+    hours = 24.0 * (scenes.EXPOSURES.mjd - scenes.EXPOSURES.mjd.min())
+    share = hours if factor == "hours" else np.array(share, float)
+    steady = {s: scenes.observe(said(sentence, values=[size * s])) for s in np.unique(share)}
+    expected = np.stack([steady[s][:, number] for number, s in enumerate(share)], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert np.abs(found / scenes.observe() - 1.0).max() > 1e-4
 
 
 def test_a_kind_of_exposures_that_is_none_is_refused():

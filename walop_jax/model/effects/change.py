@@ -42,6 +42,7 @@ Given = str | Callable[[Any], Any]
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order", "night hours")
 OF_LIST = ("exposure", "kind", "side", *SINGLE)  # forms of factors that ask for the list of exposures
+OF_RAY = ("kind", "per EXPTIME")  # those that the optics follow (`ray.Conditions`)
 SKY, BAND = "sky", "band"  # places other than elements
 
 
@@ -233,7 +234,7 @@ class Change:
             if item.form == "kind":
                 check_names("KIND of exposures", item.given, instrument.kinds)
             matching = angle is None or (item.form in ("cos", "sin") and item.given[-1] == angle)
-            single = item.form in ("cos", "sin", *OF_LIST)
+            single = item.form in ("cos", "sin", *OF_LIST) and item.form not in OF_RAY
             if item.depends_on not in allowed or (single and not matching):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""

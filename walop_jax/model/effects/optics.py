@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from walop_jax.model import mueller
 from walop_jax.model.effects.change import (
     KINDS,
+    OF_RAY,
     SINGLE,
     SLOW,
     AtPoint,
@@ -213,7 +214,12 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
         single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
         return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
     if change.where != "of":
-        further = Combinations(over, ("colour",)), Combinations(among=("all",)), _ANYTHING
+        further = (
+            Combinations(over, ("colour",)),
+            Combinations(along=OF_RAY),
+            Combinations(among=("all",)),
+            _ANYTHING,
+        )
         return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
         waves, single = Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
