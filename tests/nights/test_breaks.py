@@ -110,6 +110,15 @@ def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for
     assert third.name == first.name
 
 
+def test_a_break_beside_a_value_for_every_file_is_held_against_other_nights():
+    """The nights that are left out are files that are left out."""
+    change = np.zeros((NIGHTS, N))
+    change[40:, 5] = 1.2
+    (step,) = breaks.find(series(7, change), (*LAWS[:4], Law(("file",), spread=0.2), None), ())[0]
+    assert (step.kind, step.name) == ("step", "p5.x")
+    assert step.held_out > 0
+
+
 @pytest.mark.parametrize(
     ("text", "known"),
     [

@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,11 +30,11 @@ from scipy import linalg
 from walop_jax.model.laws import Form, Law
 
 Laws = Sequence[Law | None]
-Border = Float[np.ndarray, "_ _"]
 OfUnits = Float[np.ndarray, "u n"]
-
 Vector = Float[np.ndarray, " _"]
-Matrix = Border
+Matrix = Float[np.ndarray, "_ _"]
+
+LOCAL = ("night", "file", "walk")  # bases of laws that give a parameter values of its own in every cell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,15 +85,11 @@ class Eliminated(NamedTuple):
     """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
     block: Matrix
-    border: Border
-    before: Border
+    border: Matrix
+    before: Matrix
     factor: tuple[Matrix, bool]  # of S_c
-    left: Border  # B'_c
+    left: Matrix  # B'_c
     right: Vector  # r'_c
-
-
-def _precision(width: float) -> float:
-    return 0.0 if not np.isfinite(width) else width**-2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,22 +109,13 @@ class System:
     ) -> System:
         """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
         scale, forms = equations.scale, []
-        middle = float(equations.mjd.mean())
-        rates, spread = np.full((2, len(laws)), np.nan)
-        local = []
+        mean, width, middle = mean / scale, width / scale, float(equations.mjd.mean())
         for i, law in enumerate(laws):
-            if law is None:
-                continue
-            for form, has_prior in law.forms(bool(means[i]), middle):
-                prior = (mean[i] / scale[i], _precision(width[i] / scale[i])) if has_prior else (0.0, 0.0)
-                forms.append(Global(i, form, *prior))
-            if law.rate is not None:
-                rates[i] = law.rate / scale[i]
-            if law.spread is not None:
-                spread[i] = law.spread / scale[i]
-            if law.base in ("night", "file", "walk"):
-                local.append(i)
-        cells = _cells(equations, laws, local, mean / scale, width / scale, spread)
+            for form, has_prior in () if law is None else law.forms(bool(means[i]), middle):
+                forms.append(Global(i, form, *((mean[i], width[i] ** -2.0) if has_prior else (0.0, 0.0))))
+        rates = np.array([law and law.rate for law in laws], float) / scale  # None is NaN
+        spread = np.array([law and law.spread for law in laws], float) / scale
+        cells = _cells(equations, laws, mean, width, spread)
         return cls(equations, tuple(laws), tuple(forms), cells, rates, spread)
 
     @functools.cached_property
@@ -148,44 +136,49 @@ class System:
             values[:, g] = courses[entry.form]
         return values
 
+    @functools.cached_property
+    def states(self) -> dict[int, list[tuple[float, int, int]]]:
+        """The states of the walk of every parameter that walks, in their order: time (MJD), cell, place in the cell."""
+        states: dict[int, list[tuple[float, int, int]]] = {}
+        for c, cell in enumerate(self.cells):
+            for k in np.flatnonzero(np.isfinite(cell.mjd)).tolist():
+                states.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, k))
+        return {i: sorted(entries) for i, entries in states.items()}
 
-def _cells(
-    equations: Equations, laws: Laws, local: Sequence[int], mean: Vector, width: Vector, spread: Vector
-) -> tuple[Cell, ...]:
-    label = equations.night.copy()
-    if any(laws[i].base == "file" for i in local):  # type: ignore[union-attr]
-        for _ in range(len(label)):
-            joined = label.copy()
-            for f in range(equations.file.max() + 1):
-                of_file = label[equations.file == f]
-                between = (label >= of_file.min()) & (label <= of_file.max())
-                joined[between] = np.minimum(joined[between], of_file.min())
-            if np.array_equal(joined, label):
-                break
-            label = joined
-    cells = []
+    def steps(self) -> Iterator[tuple[float, list[int], list[int]]]:
+        """The precision of every step of a walk, with cell and place of the states before and after it."""
+        for i, states in self.states.items():
+            for (start, *before), (stop, *after) in itertools.pairwise(states):
+                yield 1.0 / (self.rates[i] ** 2 * (stop - start)), before, after
+
+
+def _cells(equations: Equations, laws: Laws, mean: Vector, width: Vector, spread: Vector) -> tuple[Cell, ...]:
+    """The cells in the order of time; the first state of a walk alone has the prior of its parameter."""
+    local = {i: law for i, law in enumerate(laws) if law is not None and law.base in LOCAL}
+    ends = np.ones(equations.night.max() + 1, bool)  # of a cell, with each night
+    if any(law.base == "file" for law in local.values()):
+        for file in np.unique(equations.file):
+            nights = equations.night[equations.file == file]
+            ends[nights.min() : nights.max()] = False
+    label = np.append(0, np.cumsum(ends))[equations.night]
+    scatters = np.isfinite(spread)
+    mean, precision = np.where(scatters, 0.0, mean), np.where(scatters, spread, width) ** -2.0
+    cells: list[Cell] = []
     for number in np.unique(label):
         units = np.flatnonzero(label == number)
-        parameter, covers, means, precisions, times = [], [], [], [], []
-        for i in local:
-            law = laws[i]
-            assert law is not None
+        parameter, covers, priors, times = [], [], [], []
+        for i, law in local.items():
             groups = equations.file[units] if law.base == "file" else equations.night[units]
-            for group in np.unique(groups):
+            walks = law.base == "walk"
+            for k, group in enumerate(np.unique(groups)):
+                members = groups == group
                 parameter.append(i)
-                covers.append((groups == group).astype(float))
-                first = law.base == "walk" and not cells and group == groups.min()
-                if law.base == "walk":
-                    prior = (mean[i], _precision(width[i])) if first else (0.0, 0.0)
-                elif np.isfinite(spread[i]):
-                    prior = (0.0, spread[i] ** -2)
-                else:
-                    prior = (mean[i], _precision(width[i]))
-                means.append(prior[0])
-                precisions.append(prior[1])
-                times.append(equations.mjd[units][groups == group].mean() if law.base == "walk" else np.nan)
-        held = (np.array(values, float) for values in (means, precisions, times))
-        cells.append(Cell(units, np.array(parameter, int), np.array(covers).reshape(-1, len(units)), *held))
+                covers.append(members)
+                priors.append((0.0, 0.0) if walks and (cells or k) else (mean[i], precision[i]))
+                times.append(equations.mjd[units][members].mean() if walks else np.nan)
+        acts = np.array(covers, float).reshape(-1, len(units))
+        centre, strength = np.array(priors, float).reshape(-1, 2).T
+        cells.append(Cell(units, np.array(parameter, int), acts, centre, strength, np.array(times, float)))
     return tuple(cells)
 
 
@@ -209,6 +202,11 @@ def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | Non
     return factor, True
 
 
+def cholesky_solve(factor: tuple[Matrix, bool], right: Any) -> Any:
+    """The inverse of a factored matrix times right sides, of which there may be none."""
+    return linalg.cho_solve(factor, right, check_finite=False) if right.size else right
+
+
 def solve(system: System) -> Solution:
     """The most probable values of all unknowns. Raises `UndeterminedError` where there is none."""
     e, at, basis = system.equations, system.at, system.basis
@@ -229,76 +227,50 @@ def solve(system: System) -> Solution:
     means = np.array([entry.mean for entry in system.globals])
     top[np.diag_indices(size)] += precision
     right += precision * means
-    rows_of: list[Any] = []
-    before: Cell | None = None
-    last: Eliminated | None = None
-    for cell in system.cells:
-        block, border, rhs = _block(system, cell)
-        coupling = _walks(system, cell, before, block, rows_of)
-        rows_of.append((block, border, rhs, coupling))
-        before = cell
-    # Forwards, after all blocks: the walk to the next cell adds to a block.
+    blocks = [_block(system, cell) for cell in system.cells]
+    sizes = [len(cell.parameter) for cell in system.cells]
+    links = [np.zeros(shape) for shape in zip(sizes, [0, *sizes[:-1]], strict=True)]  # with the cell before
+    for precision, (b, j), (c, k) in system.steps():
+        blocks[b][0][j, j] += precision
+        blocks[c][0][k, k] += precision
+        if b == c:
+            blocks[c][0][[j, k], [k, j]] -= precision
+        else:
+            links[c][k, j] = -precision
     done: list[Eliminated] = []
-    for cell, (block, border, rhs, coupling) in zip(system.cells, rows_of, strict=True):
-        left_block, reduced, remainder = block, border, rhs
-        if last is not None and coupling.any():
-            gain = linalg.cho_solve(last.factor, coupling.T, check_finite=False).T
-            left_block, reduced = block - gain @ coupling.T, border - gain @ last.left
-            remainder = rhs - gain @ last.right
-        factor = _factored(left_block, cell.parameter, int(cell.units[0])) if len(rhs) else (left_block, True)
-        last = Eliminated(block, border, coupling, factor, reduced, remainder)
-        done.append(last)
-        if len(rhs):
-            gain = linalg.cho_solve(factor, np.column_stack([reduced, remainder]), check_finite=False)
-            top -= reduced.T @ gain[:, :-1]
-            right -= reduced.T @ gain[:, -1]
-    factor = _factored(0.5 * (top + top.T), at, None) if size else (top, True)
-    shared = linalg.cho_solve(factor, right) if size else right
-    values: list[Vector] = [np.zeros(0)] * len(done)
-    for c in range(len(done) - 1, -1, -1):
-        if len(done[c].right):
-            remainder = done[c].right - done[c].left @ shared
-            if c + 1 < len(done) and len(values[c + 1]):
-                remainder = remainder - done[c + 1].before.T @ values[c + 1]
-            values[c] = linalg.cho_solve(done[c].factor, remainder, check_finite=False)
-    return Solution(system, shared, tuple(values), tuple(done), factor)
+    for cell, (block, border, rhs), link in zip(system.cells, blocks, links, strict=True):
+        reduced, left, remainder = block, border, rhs
+        if link.any():
+            gain = cholesky_solve(done[-1].factor, link.T).T
+            reduced, left = block - gain @ link.T, border - gain @ done[-1].left
+            remainder = rhs - gain @ done[-1].right
+        factor = _factored(reduced, cell.parameter, int(cell.units[0]))
+        done.append(Eliminated(block, border, link, factor, left, remainder))
+        gain = cholesky_solve(factor, np.column_stack([left, remainder]))
+        top -= left.T @ gain[:, :-1]
+        right -= left.T @ gain[:, -1]
+    factor = _factored(0.5 * (top + top.T), at, None)
+    shared = cholesky_solve(factor, right)
+    values: list[Vector] = []
+    for c in reversed(range(len(done))):
+        remainder = done[c].right - done[c].left @ shared
+        if values:
+            remainder = remainder - done[c + 1].before.T @ values[-1]
+        values.append(cholesky_solve(done[c].factor, remainder))
+    return Solution(system, shared, tuple(values[::-1]), tuple(done), factor)
 
 
-def _block(system: System, cell: Cell) -> tuple[Matrix, Border, Vector]:
-    """Own block, border and right side of a cell: priors and data, without walks."""
+def _block(system: System, cell: Cell) -> tuple[Matrix, Matrix, Vector]:
+    """Own block, border and right side of a cell: priors and data, without the steps of walks."""
     e, p = system.equations, cell.parameter
     block = np.diag(cell.precision)
     border, right = np.zeros((len(p), len(system.at))), cell.precision * cell.mean
-    if len(p):
-        for v, unit in enumerate(cell.units):
-            weighted = e.matrix[unit][p] * cell.covers[:, v : v + 1]
-            block += weighted[:, p] * cell.covers[:, v]
-            border += weighted[:, system.at] * system.basis[unit]
-            right = right - cell.covers[:, v] * e.gradient[unit][p]
+    for v, unit in enumerate(cell.units):
+        weighted = e.matrix[unit][p] * cell.covers[:, v : v + 1]
+        block += weighted[:, p] * cell.covers[:, v]
+        border += weighted[:, system.at] * system.basis[unit]
+        right = right - cell.covers[:, v] * e.gradient[unit][p]
     return block, border, right
-
-
-def _walks(system: System, cell: Cell, before: Cell | None, block: Matrix, made: Sequence[Any]) -> Border:
-    """Add the steps of walks that end in a cell to its block and the one before; the coupling of both."""
-    coupling = np.zeros((len(cell.mjd), 0 if before is None else len(before.mjd)))
-    for k in np.flatnonzero(np.isfinite(cell.mjd)):
-        i = cell.parameter[k]
-        within = np.flatnonzero((cell.parameter == i) & (cell.mjd < cell.mjd[k]))
-        previous = np.zeros(0, int) if before is None else np.flatnonzero(before.parameter == i)
-        if not len(within) and not len(previous):
-            continue
-        times, same_cell = (cell.mjd, True) if len(within) else (before.mjd, False)  # type: ignore[union-attr]
-        last = (within if same_cell else previous)[np.argmax(times[within if same_cell else previous])]
-        variance = system.rates[i] ** 2 * (cell.mjd[k] - times[last])
-        block[k, k] += 1.0 / variance
-        if same_cell:
-            block[last, last] += 1.0 / variance
-            block[k, last] -= 1.0 / variance
-            block[last, k] -= 1.0 / variance
-        else:
-            made[-1][0][last, last] += 1.0 / variance
-            coupling[k, last] = -1.0 / variance
-    return coupling
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,8 +288,7 @@ class Solution:
         """The parameters in every unit, from the origin, scaled."""
         system = self.system
         values = np.zeros((len(system.equations), len(system.laws)))
-        for g, i in enumerate(system.at):
-            values[:, i] += system.basis[:, g] * self.shared[g]
+        np.add.at(values.T, system.at, (system.basis * self.shared).T)
         for cell, local in zip(system.cells, self.local, strict=True):
             for k, i in enumerate(cell.parameter):
                 values[cell.units, i] += cell.covers[k] * local[k]
@@ -346,51 +317,32 @@ class Solution:
         system = self.system
         entries = zip(system.globals, self.shared, strict=True)
         total = sum(entry.precision * (value - entry.mean) ** 2 for entry, value in entries)
-        last: dict[int, tuple[float, float]] = {}
         for cell, local in zip(system.cells, self.local, strict=True):
-            total += float(cell.precision @ (local - cell.mean) ** 2)
-            for k in np.argsort(cell.mjd):
-                if np.isfinite(cell.mjd[k]):
-                    i = int(cell.parameter[k])
-                    if i in last:
-                        gone = cell.mjd[k] - last[i][0]
-                        total += (local[k] - last[i][1]) ** 2 / (system.rates[i] ** 2 * gone)
-                    last[i] = (float(cell.mjd[k]), float(local[k]))
+            total += cell.precision @ (local - cell.mean) ** 2
+        for precision, (b, j), (c, k) in system.steps():
+            total += precision * (self.local[c][k] - self.local[b][j]) ** 2
         return float(total)
 
     @functools.cached_property
     def covariance(self) -> Matrix:
         """Covariance of the global unknowns."""
-        size = len(self.shared)
-        return linalg.cho_solve(self.factor, np.eye(size)) if size else np.zeros((0, 0))
+        return cholesky_solve(self.factor, np.eye(len(self.shared)))
 
     @functools.cached_property
     def smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
         """Of every cell the covariance of its unknowns, that with the globals, and that with the next cell's."""
         smoothed: list[tuple[Matrix, Matrix, Matrix]] = []
-        later: tuple[Matrix, Matrix] | None = None
-        for c in range(len(self.cells) - 1, -1, -1):
-            entry, size = self.cells[c], len(self.local[c])
-            if not size:
-                later = (np.zeros((0, 0)), np.zeros((0, len(self.shared))))
-                smoothed.append((*later, np.zeros((0, 0))))
-                continue
-            after = None if c + 1 == len(self.cells) else self.cells[c + 1].before
-            joint, sides = self.covariance, entry.left
-            if after is not None and after.any():
-                block, cross = later  # type: ignore[misc]
-                joint = np.block([[joint, cross.T], [cross, block]])
-                sides = np.hstack([sides, after.T])
-            gain = linalg.cho_solve(entry.factor, sides, check_finite=False)
+        split = len(self.shared)
+        block, cross = np.zeros((0, 0)), np.zeros((0, split))  # of the next cell: none behind the last
+        for c in reversed(range(len(self.cells))):
+            entry = self.cells[c]
+            coupling = self.cells[c + 1].before.T if smoothed else np.zeros((len(entry.right), 0))
+            joint = np.block([[self.covariance, cross.T], [cross, block]])
+            gain = cholesky_solve(entry.factor, np.hstack([entry.left, coupling]))
             with_others = -gain @ joint
-            block = linalg.cho_solve(entry.factor, np.eye(size)) - with_others @ gain.T
-            split = len(self.shared)
-            next_one = with_others[:, split:]
-            if after is not None and not next_one.size and len(after):
-                # Independent locals of neighbours share the globals alone.
-                next_one = -gain @ later[1].T  # type: ignore[index]
-            later = (block, with_others[:, :split])
-            smoothed.append((block, with_others[:, :split], next_one))
+            block = cholesky_solve(entry.factor, np.eye(len(entry.right))) - with_others @ gain.T
+            cross = with_others[:, :split]
+            smoothed.append((block, cross, with_others[:, split:]))
         return smoothed[::-1]
 
     def predict(self, mjd: float, night: int | None = None) -> tuple[Vector, Matrix]:
@@ -400,31 +352,30 @@ class Solution:
         interpolated between nights (a Brownian bridge) and goes on behind the last; values of single nights and files
         are known in these alone, elsewhere they scatter as they do over the nights.
         """
-        system, n = self.system, len(self.system.laws)
-        function = system.functions(mjd)[0]
+        system, e, n = self.system, self.system.equations, len(self.system.laws)
         terms: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
-        extra = np.zeros(n)
-        value = np.zeros(n)
-        nights = [system.equations.night[cell.units] for cell in system.cells]
-        numbered = (c for c, members in enumerate(nights) if night is not None and night in members)
-        current = next(numbered, None)
+        extra, value = np.zeros(n), np.zeros(n)
+        here: tuple[int, int] | None = None  # the cell of the night, and the place of its unit in it
+        for c, cell in enumerate(system.cells):
+            if night is not None and night in e.night[cell.units]:
+                away = np.where(e.night[cell.units] == night, np.abs(e.mjd[cell.units] - mjd), np.inf)
+                here = c, int(np.argmin(away))
         for i, law in enumerate(system.laws):
-            if law is None or law.base not in ("night", "file", "walk"):
+            if law is None or law.base not in LOCAL:
                 continue
             if law.base == "walk":
                 terms += self._bridge(i, mjd, extra)
-                continue
-            places = [] if current is None else self._own(i, current, mjd, night)
-            if places:
-                terms.append((i, current, places[0], 1.0))  # type: ignore[arg-type]
-                continue
-            if np.isfinite(system.spread[i]):
+            elif here is not None:
+                cell = system.cells[here[0]]
+                (k,) = np.flatnonzero((cell.parameter == i) & (cell.covers[:, here[1]] > 0)).tolist()
+                terms.append((i, here[0], k, 1.0))
+            elif np.isfinite(system.spread[i]):
                 extra[i] += system.spread[i] ** 2
-                continue
-            scatter = self.values[:, i]
-            value[i], extra[i] = scatter.mean(), scatter.var(ddof=1) if len(scatter) > 1 else np.inf
+            else:
+                scatter = self.values[:, i]
+                value[i], extra[i] = scatter.mean(), scatter.var(ddof=1) if len(scatter) > 1 else np.inf
         design = np.zeros((n, len(self.shared) + len(terms)))
-        design[system.at, np.arange(len(self.shared))] = function
+        design[system.at, np.arange(len(self.shared))] = system.functions(mjd)[0]
         for k, (i, _, _, weight) in enumerate(terms):
             design[i, len(self.shared) + k] = weight
         local = np.array([self.local[c][k] for _, c, k, _ in terms])
@@ -433,34 +384,19 @@ class Solution:
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
-    def _own(self, i: int, c: int, mjd: float, night: int | None) -> list[int]:
-        """The unknown of a parameter in a cell that holds at a time of a night."""
-        e, cell = self.system.equations, self.system.cells[c]
-        in_night = np.flatnonzero(e.night[cell.units] == night)
-        unit = in_night[np.argmin(np.abs(e.mjd[cell.units[in_night]] - mjd))]
-        return np.flatnonzero((cell.parameter == i) & (cell.covers[:, unit] > 0)).tolist()
-
-    @functools.cached_property
-    def _states(self) -> dict[int, list[tuple[float, int, int]]]:
-        """The states of every walk: time, cell, place."""
-        states: dict[int, list[tuple[float, int, int]]] = {}
-        for c, cell in enumerate(self.system.cells):
-            for k in np.flatnonzero(np.isfinite(cell.mjd)):
-                states.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, int(k)))
-        return {i: sorted(entries) for i, entries in states.items()}
-
     def _bridge(self, i: int, mjd: float, extra: Vector) -> list[tuple[int, int, int, float]]:
-        states, rate = self._states[i], self.system.rates[i]
+        """The states beside a time with their weights; the variance of the walk between them is added to `extra`."""
+        states, rate = self.system.states[i], self.system.rates[i]
         times = [time for time, _, _ in states]
         after = int(np.searchsorted(times, mjd))
         if after in (0, len(times)):
             time, c, k = states[min(after, len(times) - 1)]
             extra[i] += rate**2 * abs(mjd - time)
             return [(i, c, k, 1.0)]
-        (start, *earlier), (stop, *two) = states[after - 1], states[after]
+        (start, *before), (stop, *behind) = states[after - 1], states[after]
         share = (mjd - start) / (stop - start)
         extra[i] += rate**2 * (mjd - start) * (1.0 - share)
-        return [(i, earlier[0], earlier[1], 1.0 - share), (i, two[0], two[1], share)]
+        return [(i, before[0], before[1], 1.0 - share), (i, behind[0], behind[1], share)]
 
     def _joint(self, parts: Sequence[tuple[int, int, int, float]]) -> Matrix:
         """Covariance of the globals and of unknowns of at most two neighbouring cells."""
@@ -484,23 +420,12 @@ class Solution:
         """Standard errors of the parameters in every unit, scaled."""
         system = self.system
         variance = np.zeros_like(self.values)
-        shared = np.array_equal(system.basis, np.ones_like(system.basis))
-        fixed = np.zeros(len(system.laws))
-        np.add.at(fixed, system.at, np.diag(self.covariance))
-        local = {i for cell in system.cells[:1] for i in cell.parameter}
-        for u in range(len(variance)):
-            if shared:
-                variance[u] = fixed
-            else:
-                design = np.zeros((len(system.laws), len(self.shared)))
-                design[system.at, np.arange(len(self.shared))] = system.basis[u]
-                variance[u] = np.einsum("ng,gh,nh->n", design, self.covariance, design, optimize=True)
-        if local:
-            for c, cell in enumerate(system.cells):
-                block, cross, _ = self.smoothed[c]
-                for k, i in enumerate(cell.parameter):
-                    units = cell.units[cell.covers[k] > 0]
-                    mine = np.flatnonzero(system.at == i)
-                    shared_part = system.basis[np.ix_(units, mine)] @ cross[k, mine]
-                    variance[units, i] += block[k, k] + 2.0 * shared_part
+        same = system.at[:, None] == system.at  # globals of one parameter
+        of_globals = system.basis * (system.basis @ (self.covariance * same))
+        np.add.at(variance.T, system.at, of_globals.T)
+        for cell, (block, cross, _) in zip(system.cells, self.smoothed, strict=True):
+            for k, i in enumerate(cell.parameter):
+                units = cell.units[cell.covers[k] > 0]
+                with_globals = system.basis[units] @ np.where(system.at == i, cross[k], 0.0)
+                variance[units, i] += block[k, k] + 2.0 * with_globals
         return np.sqrt(np.clip(variance, 0.0, None))

@@ -16,10 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import linalg
 
-from walop_jax.nights.algebra import Solution
-
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
+from walop_jax.nights.algebra import Matrix, Solution, Vector, cholesky_solve
 
 NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
 
@@ -54,8 +51,8 @@ def scan(of: Solution) -> Scan:
     scores = Scan(*(np.zeros((count, n)) for _ in range(4)))
     cross, information, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
     absorbed, border_taken = np.zeros(n), np.zeros((globals_, n))
-    after: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
-    for c in range(count - 1, -1, -1):
+    behind: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
+    for c in reversed(range(count)):
         cell, entry = system.cells[c], of.cells[c]
         cross_here = np.zeros((globals_, n))
         local, mine = np.zeros((len(cell.parameter), n)), np.zeros(n)
@@ -65,39 +62,32 @@ def scan(of: Solution) -> Scan:
             local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
             mine += np.diag(matrix)
         cross, information = cross + cross_here, information + mine
-        alone = -of.slopes[cell.units].sum(axis=0)
-        score = score + alone
-        if len(cell.parameter):
-            block, border, moved = entry.block, entry.border, local
-            if after is not None and of.cells[c + 1].before.any():
-                link = of.cells[c + 1].before
-                gain = linalg.cho_solve(after[0], link, check_finite=False).T
-                block, border = block - gain @ link, border - gain @ after[1]
-                moved = local - gain @ after[2]
-            # Precision of the cell given all others, from before and from behind; without the globals.
-            lower = entry.factor[0]
-            joint = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
-            sides = border + entry.left - entry.border
-            for columns, base_absorbed, base, into in (
-                (moved, absorbed, border_taken, 1),
-                (local, np.zeros(n), np.zeros((globals_, n)), 3),
-            ):
-                solved = linalg.cho_solve(joint, columns, check_finite=False)
-                border_rest = (cross if into == 1 else cross_here) - base - sides.T @ solved
-                total_absorbed = base_absorbed + np.einsum("kn,kn->n", columns, solved)
-                scores[into][c] = _information(
-                    of, information if into == 1 else mine, border_rest, total_absorbed
-                )
-            factor = linalg.cho_factor(block, lower=True, check_finite=False)
-            solved = linalg.cho_solve(factor, moved, check_finite=False)
-            absorbed = absorbed + np.einsum("kn,kn->n", moved, solved)
-            border_taken = border_taken + border.T @ solved
-            after = (factor, border, moved)
-        else:
-            scores[1][c] = _information(of, information, cross - border_taken, absorbed)
-            scores[3][c] = _information(of, mine, cross_here, np.zeros(n))
-        scores[0][c], scores[2][c] = score, alone
-    scores[1][0] = 0.0  # from the first night on is no change
+        scores.once_score[c] = -of.slopes[cell.units].sum(axis=0)
+        score = score + scores.once_score[c]
+        scores.step_score[c] = score
+        block, border, moved = entry.block, entry.border, local
+        if behind is not None:
+            factor, border_behind, moved_behind = behind
+            gain = cholesky_solve(factor, of.cells[c + 1].before).T
+            block, border = block - gain @ of.cells[c + 1].before, border - gain @ border_behind
+            moved = local - gain @ moved_behind
+        # Precision of the cell given all others, from before and from behind; without the globals.
+        lower = entry.factor[0]
+        joint = linalg.cho_factor(lower @ lower.T + block - entry.block, lower=True, check_finite=False)
+        sides = border + entry.left - entry.border
+        solved = cholesky_solve(joint, moved)
+        taken = absorbed + np.einsum("kn,kn->n", moved, solved)
+        beyond = cross - border_taken - sides.T @ solved
+        scores.step_information[c] = _information(of, information, beyond, taken)
+        solved = cholesky_solve(joint, local)
+        taken = np.einsum("kn,kn->n", local, solved)
+        scores.once_information[c] = _information(of, mine, cross_here - sides.T @ solved, taken)
+        factor = linalg.cho_factor(block, lower=True, check_finite=False)
+        solved = cholesky_solve(factor, moved)
+        absorbed = absorbed + np.einsum("kn,kn->n", moved, solved)
+        border_taken = border_taken + border.T @ solved
+        behind = factor, border, moved
+    scores.step_information[0] = 0.0  # from the first night on is no change
     return scores
 
 
@@ -122,13 +112,11 @@ def weighted(
                 cross += system.basis[unit][:, None] * columns[system.at]
                 local += cell.covers[:, v : v + 1] * columns[cell.parameter]
         entry = of.cells[c]
-        if len(cell.parameter):
-            if c and entry.before.any():
-                gain = linalg.cho_solve(of.cells[c - 1].factor, entry.before.T, check_finite=False).T
-                local = local - gain @ moved
-            solved = linalg.cho_solve(entry.factor, local, check_finite=False)
-            absorbed += local.T @ solved
-            border_taken += entry.left.T @ solved
+        if entry.before.any():
+            local = local - cholesky_solve(of.cells[c - 1].factor, entry.before.T).T @ moved
+        solved = cholesky_solve(entry.factor, local)
+        absorbed += local.T @ solved
+        border_taken += entry.left.T @ solved
         moved = local
     information = direct - absorbed
     if globals_:
