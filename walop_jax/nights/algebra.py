@@ -138,12 +138,12 @@ class System:
 
     @functools.cached_property
     def states(self) -> dict[int, list[tuple[float, int, int]]]:
-        """The states of the walk of every parameter that walks, in their order: time (MJD), cell, place in the cell."""
+        """The states of the walk of every parameter that walks, night by night: time (MJD), cell, place in the cell."""
         states: dict[int, list[tuple[float, int, int]]] = {}
         for c, cell in enumerate(self.cells):
             for k in np.flatnonzero(np.isfinite(cell.mjd)).tolist():
                 states.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, k))
-        return {i: sorted(entries) for i, entries in states.items()}
+        return states
 
     def steps(self) -> Iterator[tuple[float, list[int], list[int]]]:
         """The precision of every step of a walk, with cell and place of the states before and after it."""
@@ -311,17 +311,11 @@ class Solution:
         """χ² of the data."""
         return float(self.unit_chi2.sum())
 
-    @functools.cached_property
-    def penalty(self) -> float:
-        """χ² of priors and of the steps of walks."""
-        system = self.system
-        entries = zip(system.globals, self.shared, strict=True)
-        total = sum(entry.precision * (value - entry.mean) ** 2 for entry, value in entries)
-        for cell, local in zip(system.cells, self.local, strict=True):
-            total += cell.precision @ (local - cell.mean) ** 2
-        for precision, (b, j), (c, k) in system.steps():
-            total += precision * (self.local[c][k] - self.local[b][j]) ** 2
-        return float(total)
+    @property
+    def walked(self) -> list[float]:
+        """χ² of every step of a walk."""
+        pairs = ((p, self.local[c][k] - self.local[b][j]) for p, (b, j), (c, k) in self.system.steps())
+        return [float(precision * step**2) for precision, step in pairs]
 
     @functools.cached_property
     def covariance(self) -> Matrix:

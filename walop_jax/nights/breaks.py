@@ -26,7 +26,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.model.laws import YEAR, Law
+from walop_jax.model.laws import YEAR, Form, Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
 from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
@@ -87,6 +87,12 @@ class Break:
                 values[name] = tuple(value)
         return cls(**values)
 
+    def form(self, middle: float) -> Form:
+        """The change in its size against time; a drift is counted from `middle` (MJD)."""
+        if self.kind == "drift":
+            return Form("linear", middle)
+        return Form("window", self.date) if self.kind == "step" else Form("window", self.before, self.after)
+
     def law(self, law: Law | None, *, gauge: bool = False) -> Law:
         """A law with the break; None is that of a candidate, which is 0 without it, or a gauge, which has a value."""
         if self.kind == "drift":
@@ -112,28 +118,22 @@ class Tried(NamedTuple):
     information: tuple[Float[np.ndarray, "_ n"], ...]
 
     @classmethod
-    def of(cls, solution: Solution) -> Tried:
-        """Scores of all changes."""
+    def of(cls, solution: Solution, barred: Sequence[int] = ()) -> Tried:
+        """Scores of all changes; of those of `barred` parameters there is no information."""
         scan, e = changes.scan(solution), solution.system.equations
         n = len(solution.system.laws)
         course = np.repeat(((e.mjd - e.mjd.mean()) / YEAR)[:, None], n, axis=1)
-        score, information = changes.weighted(solution, course, np.arange(n))
-        scores = scan.step_score, scan.once_score, score[None]
-        return cls(scores, (scan.step_information, scan.once_information, np.diag(information)[None]))
-
-    def without(self, barred: Sequence[int]) -> Tried:
-        """The same but for some parameters."""
-        information = tuple(array.copy() for array in self.information)
-        for array in information:
-            array[:, barred] = 0.0
-        return self._replace(information=information)
+        drift_score, drift_information = changes.weighted(solution, course, np.arange(n))
+        scores = scan.step_score, scan.once_score, drift_score[None]
+        information = scan.step_information, scan.once_information, np.diag(drift_information)[None].copy()
+        for of_kind in information:
+            of_kind[:, list(barred)] = 0.0
+        return cls(scores, information)
 
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
-        informed = self.information[kind] > 0
-        return np.where(
-            informed, self.score[kind] / np.sqrt(np.where(informed, self.information[kind], 1.0)), 0.0
-        )
+        score, information = self.score[kind], self.information[kind]
+        return np.divide(score, np.sqrt(information), out=np.zeros_like(score), where=information > 0)
 
     def chance(self, u: float) -> float:
         """The bound on the probability of a |z| of u or more anywhere, if nothing has changed."""
@@ -174,20 +174,20 @@ def find(
 
     Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
     """
+
+    def largest_beside(others: Sequence[Break], chance: float) -> Break | None:
+        return _largest(data, solved(data, with_breaks(data, laws, others)), chance, catalogue, carried)
+
     breaks: list[Break] = []
-    while True:
-        solution = solved(data, with_breaks(data, laws, breaks))
-        candidate = _largest(data, solution, CHANCE, catalogue, carried)
-        if candidate is None or len(breaks) == MOST:
-            break
+    while len(breaks) < MOST and (candidate := largest_beside(breaks, CHANCE)) is not None:
         breaks.append(candidate)
     # The first were named while the others were not known: each is named again beside all others.
     for _ in range(ROUNDS if len(breaks) > 1 else 0):
-        before = [(candidate.kind, candidate.name, candidate.night) for candidate in breaks]
+        before = breaks.copy()
         for k in range(len(breaks)):
-            other_laws = with_breaks(data, laws, breaks[:k] + breaks[k + 1 :])
-            breaks[k] = _largest(data, solved(data, other_laws), 1.1, catalogue, carried) or breaks[k]
-        if [(candidate.kind, candidate.name, candidate.night) for candidate in breaks] == before:
+            breaks[k] = largest_beside(breaks[:k] + breaks[k + 1 :], 1.1) or breaks[k]
+        pairs = zip(breaks, before, strict=True)
+        if all((now.kind, now.name, now.night) == (then.kind, then.name, then.night) for now, then in pairs):
             break
     for k, candidate in enumerate(breaks):
         laws_of_others = with_breaks(data, laws, breaks[:k] + breaks[k + 1 :])
@@ -199,11 +199,9 @@ def find(
 def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     """A break with the size that a solution under its law gives it."""
     system, i = solution.system, data.names.index(one.name)
-    start = one.date if one.kind == "step" else one.before
+    form, scale = one.form(float(data.equations.mjd.mean())), float(data.equations.scale[i])
     for g, entry in enumerate(system.globals):
-        matches = entry.form.kind == "linear" if one.kind == "drift" else entry.form.start == start
-        if entry.parameter == i and matches:
-            scale = float(data.equations.scale[i])
+        if entry.parameter == i and (entry.form.kind, entry.form.start) == (form.kind, form.start):
             error = scale * math.sqrt(solution.covariance[g, g])
             return dataclasses.replace(one, size=scale * float(solution.shared[g]), error=error)
     return one
@@ -238,7 +236,7 @@ def _largest(
     carried: Carried | None,
 ) -> Break | None:
     """The most significant change, of those alike the first that is carried; None where chance does as well."""
-    tried = Tried.of(solution).without(_other_shapes(data, solution.system.laws))
+    tried = Tried.of(solution, _other_shapes(data, solution.system.laws))
     kind, cell, i = tried.largest()
     z = tried.z(kind)
     p_value = tried.chance(abs(float(z[cell, i])))
@@ -250,13 +248,13 @@ def _largest(
     chosen = next((j for j in alike if carried is None or carried(data.parameters[j])), i)
     if chosen != i:
         i, cell = chosen, low + int(near[:, chosen].argmax())
-    at, rivals = (kind, cell, i), [j for j in alike if j != i]
+    rivals = [j for j in alike if j != i]
     best, p, scale = float(z[cell, i] ** 2), data.parameters[i], float(data.equations.scale[i])
     first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
     members = {data.parameters[j].part for j in (i, *rivals)}
     remedies = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
     information = float(tried.information[kind][cell, i])
-    return Break(
+    change = Break(
         kind=KINDS[kind],
         name=p.name,
         unit=f"{p.unit}/yr".lstrip("/") if kind == 2 else p.unit,
@@ -270,8 +268,18 @@ def _largest(
         after=after,
         alike=tuple(data.names[j] for j in rivals),
         separated_by=tuple(dict.fromkeys(remedies)) if rivals else (),
-        nights_needed=_nights_needed(solution, at, rivals, best) if rivals else 0.0,
     )
+    if rivals:
+        held = 1 if change.kind == "bad night" else len(solution.system.cells) - cell
+        needed = _nights_needed(solution, _course(data, change), np.array([i, *rivals]), best, held)
+        change = dataclasses.replace(change, nights_needed=needed)
+    return change
+
+
+def _course(data: Together, change: Break) -> Float[np.ndarray, " u"]:
+    """A change of size 1 in every unit."""
+    mjd = data.equations.mjd
+    return change.form(float(mjd.mean())).at(mjd)
 
 
 def _dates(
@@ -292,19 +300,17 @@ def _dates(
     return numbers[cell], (numbers[possible[0]], numbers[possible[-1]]), before, after
 
 
-def _nights_needed(solution: Solution, at: tuple[int, int, int], rivals: Sequence[int], best: float) -> float:
-    """Nights like those that the change holds for, until the nearest rival is `SURE` standard errors away."""
-    (kind, cell, i), cells, e = at, solution.system.cells, solution.system.equations
-    course = np.zeros(len(e))
-    for entry in cells[cell:] if kind == 0 else cells[cell : cell + 1]:
-        course[entry.units] = 1.0
-    if kind == 2:
-        course = (e.mjd - e.mjd.mean()) / YEAR
-    parameter = np.array([i, *rivals])
-    _, shared = changes.weighted(solution, np.repeat(course[:, None], len(parameter), axis=1), parameter)
+def _nights_needed(
+    solution: Solution, course: np.ndarray, parameters: np.ndarray, best: float, held: int
+) -> float:
+    """Nights like the `held` ones of a change, until its nearest rival is `SURE` standard errors away.
+
+    `parameters` are those of the change, whose z² is `best`, and of its rivals.
+    """
+    courses = np.repeat(course[:, None], len(parameters), axis=1)
+    _, shared = changes.weighted(solution, courses, parameters)
     rival_information = np.maximum(np.diag(shared)[1:], 1e-300)
     least = float(np.min(best * (1.0 - shared[0, 1:] ** 2 / (shared[0, 0] * rival_information))))
-    held = len(cells) - cell if kind == 0 else 1 if kind == 1 else len(cells)
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
 
@@ -313,16 +319,13 @@ def _held_out(data: Together, laws: Laws, one: Break) -> float:
     i, halves = data.names.index(one.name), []
     for odd in (0, 1):
         keep = data.equations.night % 2 == odd
-        half, number = data.equations.only(keep), np.array([night.number for night in data.nights])[keep]
-        course = (half.mjd - data.equations.mjd.mean()) / YEAR
-        if one.kind != "drift":
-            course = (number >= one.night if one.kind == "step" else number == one.night).astype(float)
+        half = data.equations.only(keep)
         half_laws = [None if law is None else law.seen_at(half.mjd) for law in laws]
         try:
             solution = solve(System.of(half, half_laws, data.mean, data.width, data.has_value))
         except UndeterminedError:
             return math.nan
-        score, half_information = changes.weighted(solution, course[:, None], np.array([i]))
+        score, half_information = changes.weighted(solution, _course(data, one)[keep, None], np.array([i]))
         halves.append((float(score[0]), float(half_information[0, 0])))
     (score, half_information), (other_score, information) = halves
     if not half_information > 0 or not information > 0:

@@ -80,29 +80,23 @@ class Survey(Drawn):
         search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
         determines counts as none, as in a fit (`likelihood.inverses.determined`).
         """
-        system, chi2 = self.solution.system, self.solution.chi2 + self.solution.penalty
-        prior = np.array([p.prior is not None for p in self.data.parameters])
-        constraints, walks, weak = 0, set(), 0.0
-        variances = np.diag(self.solution.covariance)
-        for entry, value, variance in zip(system.globals, self.solution.shared, variances, strict=True):
-            if prior[entry.parameter]:
-                constraints += entry.precision > 0
-            else:
-                chi2 -= entry.precision * (value - entry.mean) ** 2
-                weak += entry.precision * variance
-        of_cells = zip(system.cells, self.solution.local, self.solution.smoothed, strict=True)
-        for cell, local, (spread, *_) in of_cells:
-            states = cell.parameter[np.isfinite(cell.mjd)].tolist()
-            stated = prior[cell.parameter] | np.isfinite(system.spread[cell.parameter])
-            # A step of a walk is known beforehand to be about 0: one for every state but the first.
-            constraints += int(((cell.precision > 0) & stated).sum()) + len(states) - len(set(states) - walks)
-            loose = np.where(stated, 0.0, cell.precision)
-            chi2 -= float(loose @ (local - cell.mean) ** 2)
-            weak += float(loose @ np.diag(spread))
-            walks |= set(states)
-        unknown = len(system.globals) + sum(len(cell.parameter) for cell in system.cells)
+        solution, system = self.solution, self.solution.system
+        cells, has_prior = system.cells, np.array([p.prior is not None for p in self.data.parameters])
+        parameter = np.concatenate([system.at, *(cell.parameter for cell in cells)])
+        precision = [[entry.precision for entry in system.globals], *(cell.precision for cell in cells)]
+        mean = [[entry.mean for entry in system.globals], *(cell.mean for cell in cells)]
+        away = np.concatenate([solution.shared, *solution.local]) - np.concatenate(mean)
+        variance = [np.diag(solution.covariance), *(np.diag(block) for block, *_ in solution.smoothed)]
+        local = np.arange(len(parameter)) >= len(system.at)
+        stated = has_prior[parameter] | (local & np.isfinite(system.spread[parameter]))
+        priors = np.where(stated, np.concatenate(precision), 0.0)
+        loose = np.concatenate(precision) - priors
+        chi2 = solution.chi2 + priors @ away**2 + sum(solution.walked)
+        # A step of a walk is expected to be about 0: a constraint as well.
+        constraints = np.count_nonzero(priors) + len(solution.walked)
         data = sum(night.dof for night in self.data.nights)
-        return float(chi2), int(data + constraints - unknown + round(weak))
+        unknowns = len(parameter) - round(float(loose @ np.concatenate(variance)))
+        return float(chi2), int(data + constraints - unknowns)
 
     @functools.cached_property
     def verdict(self) -> Verdict:
@@ -291,13 +285,11 @@ class Survey(Drawn):
         """
         data, solution = self.data, self.solution
         shape, scale, scores = (len(data.nights), len(data.names)), data.equations.scale, scan(self.solution)
-        alone = np.full(shape, np.nan)
-        deviation = alone.copy()
+        cell_of = np.zeros(len(data.nights), int)
         for c, cell in enumerate(solution.system.cells):
-            informed = scores.once_information[c] > 0
-            information = scores.once_information[c, informed]
-            deviation[np.ix_(cell.units, informed)] = scores.once_score[c, informed] / information
-            alone[np.ix_(cell.units, informed)] = information**-0.5
+            cell_of[cell.units] = c
+        information = np.where(scores.once_information > 0, scores.once_information, np.nan)[cell_of]
+        deviation, alone = scores.once_score[cell_of] / information, information**-0.5
         laws = ["absent" if law is None else " ".join(law.per) for law in self.laws]
 
         def by_night(of: Sequence[Any]) -> np.ndarray:
