@@ -6,8 +6,9 @@ A row of 127 parameters takes 67 kB. All extensions carry checksums; the file ap
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -26,36 +27,29 @@ from walop_jax.nights.equations import EffectAmplitude, Night
 NIGHTVER = 1
 _NAN = float("nan")
 _AGAIN = "make the nights again and write them anew"
-_OF_PARAMETERS = ("START", "PRIOR_MEAN", "PRIOR_WIDTH", "LOOSE", "SCALE")
+_NUMBERS = ("START", "PRIOR_MEAN", "PRIOR_WIDTH", "LOOSE", "SCALE")
 _PARAMETERS = {
     **dict.fromkeys(("NAME", "UNIT"), Column("str")),
-    **dict.fromkeys(_OF_PARAMETERS, Column("float", missing=_NAN)),
+    **dict.fromkeys(_NUMBERS, Column("float", missing=_NAN)),
     "CANDIDATE": Column("bool"),
 }
-_NIGHTS = {
-    "NIGHT": Column("int"),
-    **dict.fromkeys(("MJD_BEG", "MJD_END", "MJD"), Column("float", "d")),
-    **dict.fromkeys(("FILTERS", "SOURCE", "SHA256"), Column("str")),
-    **dict.fromkeys(("NDATA", "DOF"), Column("int")),
-    "CHI2": Column("float"),
-    **dict.fromkeys(("REFERENCE", "GRADIENT", "MATRIX"), Column("float", width=None)),
+_FIELDS = {
+    "NIGHT": ("number", Column("int")),
+    "MJD_BEG": ("begin", Column("float", "d")),
+    "MJD_END": ("end", Column("float", "d")),
+    "MJD": ("mjd", Column("float", "d")),
+    "FILTERS": ("filters", Column("str")),
+    "SOURCE": ("source", Column("str")),
+    "SHA256": ("sha256", Column("str")),
+    "NDATA": ("n_data", Column("int")),
+    "DOF": ("dof", Column("int")),
+    "CHI2": ("chi2", Column("float")),
+    "REFERENCE": ("reference", Column("float", width=None)),
+    "GRADIENT": ("gradient", Column("float", width=None)),
+    "MATRIX": ("matrix", Column("float", width=None)),
 }
-
-
-_PLAIN = {
-    "NIGHT": ("number", int),
-    "MJD_BEG": ("begin", float),
-    "MJD_END": ("end", float),
-    "MJD": ("mjd", float),
-    "SOURCE": ("source", str),
-    "SHA256": ("sha256", str),
-    "NDATA": ("n_data", int),
-    "DOF": ("dof", int),
-    "CHI2": ("chi2", float),
-    "REFERENCE": ("reference", np.asarray),
-    "GRADIENT": ("gradient", np.asarray),
-}
-"""Columns of NIGHTS that hold a field of `Night` as it is, and the field's kind."""
+"""Columns of NIGHTS and the field of a `Night` in each: filters as one text, of the matrix the lower triangle."""
+_NIGHTS = {name: column for name, (_, column) in _FIELDS.items()}
 
 
 def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overwrite: bool = False) -> None:
@@ -66,35 +60,38 @@ def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overw
     first = nights[0]
     if any(night.names != first.names or night.model != first.model for night in nights):
         raise ValueError("nights of different parameters go into files of their own")
-    priors = np.array([p.prior or (_NAN, _NAN) for p in first.parameters]).reshape(-1, 2)
-    n, lower = len(first.names), np.tril_indices(len(first.names))
+    p, lower = first.parameters, np.tril_indices(len(first.names))
     parameters = {
-        "NAME": _texts(first.names),
-        "UNIT": _texts(p.unit for p in first.parameters),
-        "START": np.array([p.start for p in first.parameters]),
-        "PRIOR_MEAN": priors[:, 0],
-        "PRIOR_WIDTH": priors[:, 1],
-        "LOOSE": np.array([_NAN if p.loose is None else p.loose for p in first.parameters]),
-        "SCALE": np.array([p.scale for p in first.parameters]),
-        "CANDIDATE": np.arange(n) >= n - first.candidates,
+        "NAME": first.names,
+        "UNIT": [entry.unit for entry in p],
+        "START": [entry.start for entry in p],
+        "PRIOR_MEAN": [entry.prior and entry.prior[0] for entry in p],
+        "PRIOR_WIDTH": [entry.width for entry in p],
+        "LOOSE": [entry.loose for entry in p],
+        "SCALE": [entry.scale for entry in p],
+        "CANDIDATE": np.arange(len(p)) >= len(p) - first.candidates,
     }
-    rows = {
-        name: (_texts if kind is str else np.array)([getattr(night, field) for night in nights])
-        for name, (field, kind) in _PLAIN.items()
-    }
-    rows["FILTERS"] = _texts(" ".join(night.filters) for night in nights)
-    rows["MATRIX"] = np.stack([night.matrix[lower] for night in nights])
+    stored = [
+        vars(night) | {"filters": " ".join(night.filters), "matrix": night.matrix[lower]} for night in nights
+    ]
+    rows = {name: [values[field] for values in stored] for name, (field, _) in _FIELDS.items()}
     primary = fits.PrimaryHDU()
     cards = {"INSTRUME": first.instrument, "CREATOR": "walop-jax", "MODEL": first.model}
     primary.header.update(NIGHTVER=NIGHTVER, **cards)
     tables = ("PARAMETERS", parameters, _PARAMETERS), ("NIGHTS", rows, _NIGHTS)
-    hdus = [primary, *(table_hdu(name, columns, path, rules) for name, columns, rules in tables)]
+    hdus = [primary, *(_table(name, columns, path, rules) for name, columns, rules in tables)]
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(hdus, temporary)
 
 
-def _texts(values: Iterable[str]) -> np.ndarray:
-    return np.array([in_ascii(str(value)) for value in values], dtype=np.str_)
+def _table(name: str, columns: Mapping[str, Any], path: Any, rules: Mapping[str, Column]) -> fits.BinTableHDU:
+    """A table of values by the rules of their columns: texts in ASCII, NaN for None."""
+    arrays = {}
+    for column, values in columns.items():
+        if (kind := rules[column].kind) == "str":
+            values = [in_ascii(text) for text in values]
+        arrays[column] = np.array(values, kind)
+    return table_hdu(name, arrays, path, rules)
 
 
 def read_nights(path: str | os.PathLike[str]) -> list[Night]:
@@ -121,39 +118,28 @@ def _nights(opened: OpenFile) -> list[Night]:
         if rows[name].shape[1] != width or not np.isfinite(rows[name]).all():
             what = f"is not {width} finite numbers a row"
             raise fail(what, file=path, extension="NIGHTS", column=name, advice=_AGAIN)
-    numbers, parameters = (table[name].tolist() for name in _OF_PARAMETERS), []
-    entries = zip(table["NAME"], table["UNIT"], *numbers, table["CANDIDATE"], strict=True)
+    parameters = []
+    entries = zip(*(table[name].tolist() for name in _PARAMETERS), strict=True)
     for name, unit, start, mean, width, loose, scale, candidate in entries:
-        texts = {
-            "name": str(name),
-            "unit": str(unit),
-            "about": "",
-            "source": "",
-            "part": str(name).partition(".")[0],
-        }
-        limits = {
-            "prior": None if np.isnan(width) else (mean, width),
-            "loose": None if np.isnan(loose) else loose,
-        }
-        p = Parameter(**texts, start=start, scale=scale, **limits)
+        prior = None if np.isnan(width) else (mean, width)
+        p = Parameter(
+            name, unit, "", "", start, prior, scale=scale, loose=None if np.isnan(loose) else loose,
+            part=name.partition(".")[0],
+        )  # fmt: skip
         # Candidates that start elsewhere are gauges of the model.
         parameters.append(EffectAmplitude.read(p) if candidate and start == 0.0 else p)
     lower, nights = np.tril_indices(n), []
     for k in range(len(rows["NIGHT"])):
+        values: dict[str, Any] = {
+            field: rows[name][k] if rows[name].ndim > 1 else rows[name][k].item()
+            for name, (field, _) in _FIELDS.items()
+        }
         matrix = np.zeros((n, n))
-        matrix[lower] = rows["MATRIX"][k]
-        matrix = matrix + np.tril(matrix, -1).T
-        nights.append(
-            Night(
-                instrument=str(header.get("INSTRUME", "")),
-                model=str(header.get("MODEL", "")),
-                filters=tuple(str(rows["FILTERS"][k]).split()),
-                parameters=tuple(parameters),
-                candidates=int(table["CANDIDATE"].sum()),
-                matrix=matrix,
-                **{field: kind(rows[name][k]) for name, (field, kind) in _PLAIN.items()},
-            )
-        )
+        matrix[lower] = values["matrix"]
+        values |= {"matrix": matrix + np.tril(matrix, -1).T, "filters": tuple(values["filters"].split())}
+        instrument, model = (str(header.get(card, "")) for card in ("INSTRUME", "MODEL"))
+        of_all = {"parameters": tuple(parameters), "candidates": int(table["CANDIDATE"].sum())}
+        nights.append(Night(instrument=instrument, model=model, **of_all, **values))
     return nights
 
 
