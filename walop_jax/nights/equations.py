@@ -418,33 +418,30 @@ def together(nights: Sequence[Night]) -> Together:
         raise fail("no night was given", advice="give fits, sets or files of nights")
     ordered = tuple(sorted(nights, key=lambda night: (night.mjd, night.sha256)))
     check_together(ordered)
-    union: dict[str, Parameter] = {}
-    for candidate in (False, True):
-        for night in ordered:
-            cut = len(night.parameters) - night.candidates
-            for p in night.parameters[cut:] if candidate else night.parameters[:cut]:
-                union.setdefault(p.name, p)
-    of_model = {p.name for night in ordered for p in night.parameters[: len(night.names) - night.candidates]}
-    names, n = list(union), len(union)
-    place, origin = {name: k for k, name in enumerate(names)}, np.full(n, np.nan)
-    gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
-    chi2 = np.zeros(len(ordered))
+    of_model: dict[str, Parameter] = {}
+    beyond: dict[str, Parameter] = {}
     for night in ordered:
-        at = np.array([place[name] for name in night.names])
-        origin[at] = np.where(np.isnan(origin[at]), night.reference, origin[at])
+        for k, p in enumerate(night.parameters):
+            is_candidate = k >= len(night.parameters) - night.candidates
+            (beyond if is_candidate else of_model).setdefault(p.name, p)
+    union = of_model | {name: p for name, p in beyond.items() if name not in of_model}
+    place, n = {name: k for k, name in enumerate(union)}, len(union)
+    origin, chi2 = np.full(n, np.nan), np.zeros(len(ordered))
+    gradient, matrix = np.zeros((len(ordered), n)), np.zeros((len(ordered), n, n))
     for u, night in enumerate(ordered):
         at = np.array([place[name] for name in night.names])
+        origin[at] = np.where(np.isnan(origin[at]), night.reference, origin[at])
         moved = origin[at] - night.reference
         slope = night.matrix @ moved
         chi2[u] = night.chi2 + 2.0 * night.gradient @ moved + moved @ slope
         gradient[u, at] = night.gradient + slope
         matrix[u][np.ix_(at, at)] = night.matrix
     mean, width = np.zeros(n), np.full(n, np.inf)
-    for k, p in enumerate(union.values()):
-        if p.name in of_model and (p.prior is not None or p.loose is not None):
+    for k, p in enumerate(of_model.values()):
+        if p.prior is not None or p.loose is not None:
             centre, width[k] = p.prior if p.prior is not None else (p.start, p.loose)
             mean[k] = centre - origin[k]
-    total = np.einsum("uii->i", matrix) + np.where(np.isfinite(width), width**-2.0, 0.0)
+    total = np.einsum("uii->i", matrix) + width**-2.0
     scale = 1.0 / np.sqrt(np.where(total > 0, total, 1.0))
     gradient *= scale
     matrix *= scale

@@ -152,39 +152,27 @@ class Maker:
         return self._candidates[key]
 
 
-class Makers:
-    """A `Maker` here, or one in every process of an executor; sets that are copies of each other are refused."""
+def made(maker: Maker, executor: Executor | None, tasks: Sequence[Task]) -> Iterator[list[Night]]:
+    """The nights of each task, in their order, made here or by an executor.
 
-    def __init__(self, maker: Maker, executor: Executor | None = None) -> None:
-        """Make nights by `executor`, or here where there is none."""
-        self.like, self._maker, self._executor = maker.like, maker, executor
-        self._seen: dict[int, str] = {}
-
-    def make(self, tasks: Sequence[Task]) -> Iterator[list[Night]]:
-        """The nights of each task, in their order.
-
-        Raises `DataError` as `Maker.make` does, and for measurements that are in the data of an earlier task as well.
-        """
-        for result in self._made(tasks):
-            if result.sketch:
-                self._refuse_copies(result.source, result.sketch)
-            if result.error is not None:
-                raise result.error
-            yield result.nights
-
-    def _made(self, tasks: Sequence[Task]) -> Iterable[Made]:
-        if self._executor is None:
-            return map(self._maker.make, tasks)
-        recipe = pickle.dumps((self.like, self._maker.folder, self._maker.count))
-        return mapped(make, [(recipe, task) for task in tasks], self._executor)
-
-    def _refuse_copies(self, here: str, smallest: frozenset[int]) -> None:
-        shared = Counter(self._seen[number] for number in smallest if number in self._seen)
-        if shared and (closest := shared.most_common(1)[0])[1] > COPIED * len(smallest):
-            share = f"{100 * closest[1] / len(smallest):.0f} %"
-            what = f"{share} of its measurements are in {closest[0]} as well"
-            raise fail(what, file=here, advice="leave one out: repeated data would shrink the errors")
-        self._seen |= dict.fromkeys(smallest, here)
+    Raises `DataError` as `Maker.make` does, and for measurements that are in the data of an earlier task as well.
+    """
+    results: Iterable[Made] = map(maker.make, tasks)
+    if executor is not None:
+        recipe = pickle.dumps((maker.like, maker.folder, maker.count))
+        results = mapped(make, [(recipe, task) for task in tasks], executor)
+    seen: dict[int, str] = {}
+    for result in results:
+        shared = Counter(seen[number] for number in result.sketch if number in seen)
+        if shared and (closest := shared.most_common(1)[0])[1] > COPIED * len(result.sketch):
+            what = f"{100 * closest[1] / len(result.sketch):.0f} % of its measurements are in {closest[0]} as well"
+            raise fail(
+                what, file=result.source, advice="leave one out: repeated data would shrink the errors"
+            )
+        seen |= dict.fromkeys(result.sketch, result.source)
+        if result.error is not None:
+            raise result.error
+        yield result.nights
 
 
 def make(given: tuple[bytes, Task]) -> Made:

@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import math
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
@@ -40,13 +40,14 @@ from walop_jax.nights.algebra import Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, at_solution, solved
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
-from walop_jax.nights.making import Data, Maker, Makers, Task
+from walop_jax.nights.making import Data, Maker, Task, made
 from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
 from walop_jax.posterior.run import Run
 
 Laws = Sequence[Law | None]
 AtHand = Mapping[tuple[str, int], Data]
+Make = Callable[[Sequence[Task]], Iterator[list[Night]]]
 OfUnits = Float[np.ndarray, "u n"]
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
@@ -99,10 +100,10 @@ def stack(
     fits = [entry for entry in (like, *(source.fit for source in opened)) if entry is not None]
     held = [Calibration.from_fit(entry) if isinstance(entry, FitResult) else entry for entry in fits[:1]]
     maker = Maker(held[0] if held else None, partial, len(opened))
-    makers = Makers(maker, executor)
+    make = functools.partial(made, maker, executor)
     all_nights: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}
-    new = makers.make([Task(entry.data) for entry in opened if entry.data is not None])
+    new = make([Task(entry.data) for entry in opened if entry.data is not None])
     for k, entry in enumerate(opened):
         source = entry.nights
         if entry.data is not None:
@@ -127,7 +128,7 @@ def stack(
             new_breaks, chosen, _ = breaks_of(data, chosen, catalogue, carried)
             breaks += new_breaks
         before = data.reference
-        data, solution, settled = _settled(data, chosen, at_hand, makers)
+        data, solution, settled = _settled(data, chosen, at_hand, make)
         moving = ~data.has_value & np.array([law is not None for law in chosen])
         if at_hand and moving.any():
             # Columns of candidates are those of where the nights were, as far as they do not follow the parameters:
@@ -137,8 +138,8 @@ def stack(
             sizes = 1.0 + np.abs(values / sigma)[:, moving].sum(axis=1)
             order = sorted(distance, key=lambda u: -distance[u] * sizes[u])
             names = frozenset(itertools.compress(data.names, moving))
-            data, *_ = _linearised(data, solution, chosen, order, at_hand, makers, names)
-            data, solution, settled = _settled(data, chosen, at_hand, makers)
+            data, *_ = _linearised(data, solution, chosen, order, at_hand, make, names)
+            data, solution, settled = _settled(data, chosen, at_hand, make)
     except UndeterminedError as error:
         raise _undetermined(data, error) from None
     if not settled:
@@ -240,7 +241,7 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
         return _Opened([], Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest()))
 
 
-def _settled(data: Together, laws: Laws, at_hand: AtHand, makers: Makers) -> tuple[Together, Solution, bool]:
+def _settled(data: Together, laws: Laws, at_hand: AtHand, make: Make) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
     A missing effect may lead ever farther away: the search ends where all nights come no closer.
@@ -254,7 +255,7 @@ def _settled(data: Together, laws: Laws, at_hand: AtHand, makers: Makers) -> tup
         if max(away.values()) >= farthest:
             break
         farthest = max(away.values())
-        data, solution, anew, enough = _linearised(data, solution, laws, again, at_hand, makers)
+        data, solution, anew, enough = _linearised(data, solution, laws, again, at_hand, make)
     return data, solution, False
 
 
@@ -273,7 +274,7 @@ def _linearised(
     laws: Laws,
     again: Collection[int],
     at_hand: AtHand,
-    makers: Makers,
+    make: Make,
     candidates: frozenset[str] = frozenset(),
 ) -> tuple[Together, Solution, list[int], bool]:
     """Linearise nights `again` at a solution, with candidates, until the rest may stay; which were, and whether it may.
@@ -288,7 +289,7 @@ def _linearised(
             break
         at = {u: dict(zip(data.names, values[u].tolist(), strict=True)) for u in batch}
         tasks = [Task(at_hand[nights[u].key], nights[u], at[u], candidates) for u in batch]
-        *earlier, (last,) = makers.make(tasks)
+        *earlier, (last,) = make(tasks)
         for u, (night,) in zip(batch, earlier, strict=False):
             nights[u] = night
         seeing = len(batch) == max(1, begin)  # the first, second, fourth …: solving costs time as well
