@@ -322,7 +322,7 @@ def _held_out(data: Together, laws: Laws, one: Break) -> float:
         half = data.equations.only(keep)
         half_laws = [None if law is None else law.seen_at(half.mjd) for law in laws]
         try:
-            solution = solve(System.of(half, half_laws, data.mean, data.width, data.has_value))
+            solution = solved(dataclasses.replace(data, equations=half), half_laws)
         except UndeterminedError:
             return math.nan
         score, half_information = changes.weighted(solution, _course(data, one)[keep, None], np.array([i]))

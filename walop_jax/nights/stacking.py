@@ -66,7 +66,7 @@ class _Opened(NamedTuple):
 
     nights: list[Night]
     data: Data | None = None
-    fit: Calibration | FitResult | None = None
+    fit: Calibration | None = None
     breaks: tuple[Break, ...] = ()
     events: tuple[tuple[float, str], ...] = ()
 
@@ -97,9 +97,9 @@ def stack(
     nights without a filter in common; ValueError for laws that are wrong, or of parameters that do not exist.
     """
     opened = [_opened(entry, catalogue) for entry in nights]
+    like = Calibration.from_fit(like) if isinstance(like, FitResult) else like
     fits = [entry for entry in (like, *(source.fit for source in opened)) if entry is not None]
-    held = [Calibration.from_fit(entry) if isinstance(entry, FitResult) else entry for entry in fits[:1]]
-    maker = Maker(held[0] if held else None, partial, len(opened))
+    maker = Maker(fits[0] if fits else None, partial, len(opened))
     make = functools.partial(made, maker, executor)
     all_nights: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}
@@ -146,8 +146,9 @@ def stack(
         what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
     if fixed := sum(night.key not in at_hand for night in data.nights):
-        what = f"{fixed} of {len(data.nights)} nights stay as they were linearised"
-        what += ": their data are not at hand"
+        what = (
+            f"{fixed} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
+        )
         doubts.append(Doubt(Quality(0), what, blocking=False))
     happened = {event for source in opened for event in source.events}
     happened |= set(() if events is None else events_of(events))
@@ -328,16 +329,15 @@ def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Para
     return all(change.of_stars for orders in changes for _, change in orders)
 
 
-def _about_fits(fits: Sequence[Calibration | FitResult]) -> list[Doubt]:
+def _about_fits(fits: Sequence[Calibration]) -> list[Doubt]:
     doubts = []
     for fit in fits:
-        verdict = fit.verdict if isinstance(fit, Calibration) else fit.checked_verdict()
-        where = str(fit.path or source_of(fit)) if isinstance(fit, Calibration) else source_of(fit.calset)
-        if (fit.errors_from if isinstance(fit, FitResult) else verdict.errors_from) != STATED:
+        where = str(fit.path or source_of(fit))
+        if fit.verdict.errors_from != STATED:
             what = f"the errors of {where} do not explain its scatter, and nights are weighed by them"
             raise fail(what, advice="correct N_ERR, or leave the night out")
-        if not verdict.trusted:
-            doubts.append(Doubt(verdict.quality, f"the fit of {where} is not trusted"))
+        if not fit.verdict.trusted:
+            doubts.append(Doubt(fit.verdict.quality, f"the fit of {where} is not trusted"))
     return doubts
 
 

@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import two_digits, value_and_error
-from walop_jax.model.effects import EffectKind
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Solution
@@ -123,15 +122,25 @@ class Survey(Drawn):
     # ---------------------------------------------------------------------------------------------- at a moment
 
     @property
+    def _first(self) -> float:
+        """The first exposure (MJD)."""
+        return min(night.begin for night in self.data.nights)
+
+    @property
+    def last(self) -> float:
+        """The last exposure (MJD)."""
+        return max(night.end for night in self.data.nights)
+
+    @property
     def span(self) -> tuple[float, float]:
         """Beginning and end of the validity (MJD), half-open."""
-        return min(night.begin for night in self.data.nights) - HALF_A_DAY, self.until
+        return self._first - HALF_A_DAY, self.until
 
     @functools.cached_property
     def until(self) -> float:
         """The end of the validity (MJD): see the head of this file."""
-        begin, end = min(night.begin for night in self.data.nights), self.last
-        latest = end + max(end - begin, HALF_A_DAY)
+        end = self.last
+        latest = end + max(end - self._first, HALF_A_DAY)
         if self._matrix is None or self.error_of_p(latest) <= GOAL / 2:
             return latest
         low, high = end, latest
@@ -165,11 +174,6 @@ class Survey(Drawn):
         structure = covariance - slopes @ product.covariance @ slopes.swapaxes(1, 2)
         good = measures_u(matrix.reshape(-1, 2, 3))
         return (matrix[good], slopes[good], structure[good], float(np.mean(~good))) if good.any() else None
-
-    @property
-    def last(self) -> float:
-        """The last exposure (MJD)."""
-        return max(night.end for night in self.data.nights)
 
     @property
     def changing(self) -> dict[str, Law]:
@@ -257,19 +261,18 @@ class Survey(Drawn):
         like = self.reference
         model = like.model
         context = effect_context(model.template, like.exposures)
-        candidates = [
-            p for p, law, has in zip(self.data.parameters, self.laws, self.data.has_value, strict=True)
-            if law is not None and not has and p.name not in model.names and isinstance(p, EffectAmplitude)
+        added = [
+            p for p, law in zip(self.data.parameters, self.laws, strict=True)
+            if law is not None and isinstance(p, EffectAmplitude) and p.name not in model.names
         ]  # fmt: skip
         shapes: dict[str, tuple[int, int]] = {}
-        for p in candidates:
-            part, (group, member) = p.part, (shape := p.shape)
-            if shapes.setdefault(part, shape) != shape or part in self.reference.model.effect_names:
+        for p in added:
+            if shapes.setdefault(p.part, p.shape) != p.shape or p.part in like.model.effect_names:
                 what = f"{p.name} is one shape of its effect, and the model has another"
                 raise fail(what, advice="put the effect into the model file and fit the nights again")
-            kind: EffectKind = next(entry for entry in model.catalogue if entry.name == part)
-            if part not in model.effect_names:
-                model = with_effects(model, [kind.probes(context)[group][member]], context)
+            if p.part not in model.effect_names:
+                groups, (group, member) = effect_by_name(p.part, model.catalogue).probes(context), p.shape
+                model = with_effects(model, [groups[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
         return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
@@ -291,24 +294,18 @@ class Survey(Drawn):
         information = np.where(scores.once_information > 0, scores.once_information, np.nan)[cell_of]
         deviation, alone = scores.once_score[cell_of] / information, information**-0.5
         laws = ["absent" if law is None else " ".join(law.per) for law in self.laws]
-
-        def by_night(of: Sequence[Any]) -> np.ndarray:
-            return np.repeat(np.array(of), shape[1])
-
-        def by_parameter(of: Sequence[Any]) -> np.ndarray:
-            return np.tile(np.array(of), shape[0])
-
+        night, parameter = np.indices(shape).reshape(2, -1)  # of every row
         values, errors = data.origin + solution.values * scale, solution.errors() * scale
         return astropy_table({
-            "NAME": (by_parameter(data.names), "", "parameter, or candidate beyond the model"),
-            "NIGHT": (by_night([n.number for n in data.nights]), "", "MJD of the evening"),
-            "MJD": (by_night([n.mjd for n in data.nights]), "d", "mean of the exposures, UTC"),
+            "NAME": (np.array(data.names)[parameter], "", "parameter, or candidate beyond the model"),
+            "NIGHT": (np.array([n.number for n in data.nights])[night], "", "MJD of the evening"),
+            "MJD": (data.equations.mjd[night], "d", "mean of the exposures, UTC"),
             "VALUE": (values.ravel(), "", "under the law"),
             "ERROR": (errors.ravel(), "", "standard error of VALUE"),
             "DEVIATION": ((deviation * scale).ravel(), "", "departure of the night alone"),
             "DEVIATION_ERR": ((alone * scale).ravel(), "", "its standard error"),
-            "LAW": (by_parameter(laws), "", "law of the parameter"),
-            "UNIT": (by_parameter([p.unit for p in data.parameters]), "", "of the values"),
+            "LAW": (np.array(laws)[parameter], "", "law of the parameter"),
+            "UNIT": (np.array([p.unit for p in data.parameters])[parameter], "", "of the values"),
         })  # fmt: skip
 
     def to_table(self) -> Any:
@@ -332,7 +329,7 @@ class Survey(Drawn):
         return {
             "trusted": verdict.trusted, "quality": int(verdict.quality), "chi2": verdict.chi2, "dof": verdict.dof,
             "n_data": verdict.n_data, "nights": len({night.number for night in self.data.nights}),
-            "first": min(night.begin for night in self.data.nights), "last": self.last,
+            "first": self._first, "last": self.last,
             "valid_from": start, "valid_until": stop, "validity": self.validity,
             "error_of_p": None if self._matrix is None else self.error_of_p(self.last),
             "without_u": None if self._matrix is None else self._matrix[3],
