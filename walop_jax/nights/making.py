@@ -32,8 +32,15 @@ from walop_jax.io.code import files_of_users, run_file
 from walop_jax.io.errors import DataError, fail
 from walop_jax.model.compiled import switch_on
 from walop_jax.model.specification import Model
-from walop_jax.nights import equations
-from walop_jax.nights.equations import Candidates, Night
+from walop_jax.nights.equations import (
+    Candidates,
+    Night,
+    candidates_of,
+    model_hash,
+    night_equations,
+    source_of,
+    with_candidates_of,
+)
 from walop_jax.nights.night_file import read_nights, write_nights
 from walop_jax.posterior.run import Run
 
@@ -97,10 +104,10 @@ class Maker:
         if self.like is None:
             what = "is a set, and there are no values at which to linearise it"
             advice = "give --like RUN, a fit of the same model (like= in Python)"
-            raise fail(f"{equations.source_of(data.read())} {what}", advice=advice)
+            raise fail(f"{source_of(data.read())} {what}", advice=advice)
         place = None
         if self.folder is not None:
-            named = f"{data.sha256} {equations.model_hash(data.model or self.like.model)}"
+            named = f"{data.sha256} {model_hash(data.model or self.like.model)}"
             place = self.folder / f"night-{hashlib.sha256(named.encode()).hexdigest()[:16]}.fits"
             if place.exists():
                 return Made(read_nights(place))
@@ -110,13 +117,13 @@ class Maker:
         table = calset.intensities
         measured = sketch(calset, table) if isinstance(table, TableIntensities) else frozenset[int]()
         try:
-            nights = equations.night_equations(calset, model, values, candidates, own=True, sets=self.count)
+            nights = night_equations(calset, model, values, candidates, own=True, sets=self.count)
         except DataError as error:
-            return Made([], equations.source_of(calset), measured, error)
+            return Made([], source_of(calset), measured, error)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_nights(place, nights, overwrite=True)
-        return Made(nights, equations.source_of(calset), measured)
+        return Made(nights, source_of(calset), measured)
 
     def _again(self, night: Night, task: Task) -> Made:
         """The night linearised at other values, with some candidates; the others follow (`with_candidates_of`)."""
@@ -129,10 +136,8 @@ class Maker:
         held = zip(night.names[cut:], night.reference[cut:].tolist(), strict=True)
         # A gauge stays where its column was made.
         values = dict(task.values) | {name: value for name, value in held if name not in candidates}
-        (anew,) = equations.night_equations(
-            calset, model, values, candidates, number=night.number, sets=self.count
-        )
-        return Made([equations.with_candidates_of(anew, night)])
+        (anew,) = night_equations(calset, model, values, candidates, number=night.number, sets=self.count)
+        return Made([with_candidates_of(anew, night)])
 
     def _set_and_model(self, data: Data) -> tuple[CalibrationSet, Model]:
         assert self.like is not None
@@ -148,7 +153,7 @@ class Maker:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self._candidates:
-            self._candidates[key] = equations.candidates_of(model, calset.exposures, model.catalogue)
+            self._candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
         return self._candidates[key]
 
 
