@@ -139,12 +139,9 @@ class Available:
                 raise ValueError(f"seconds: {kind} = {list(times)}; give exposure times above 0")
         if not -90.0 <= self.altitude < 90.0:
             raise ValueError(f"altitude = {self.altitude}: give degrees above the horizon, below 90")
-        if self.any_plate and (self.plan.design.polariser is None or not self._has_plate):
+        design = self.plan.design
+        if self.any_plate and (design.polariser is None or CALIBRATION_PLATE not in design.moving()):
             raise ValueError(f'plate = "{ANY}": {self.plan.name} has no polariser with a calibration plate')
-
-    @property
-    def _has_plate(self) -> bool:
-        return CALIBRATION_PLATE in self.plan.design.moving()
 
     @classmethod
     def of(cls, given: Available | ObservingPlan | str | os.PathLike[str]) -> Available:
@@ -155,7 +152,7 @@ class Available:
             return cls(given)
         if not is_plan(given):
             plain = cls(ObservingPlan(str(given)))
-            return dataclasses.replace(plain, any_plate=plain._has_plate)
+            return dataclasses.replace(plain, any_plate=CALIBRATION_PLATE in plain.plan.design.moving())
         with errors_naming(given):
             return cls.read(parse_toml(read_text(given)), Path(given).parent)
 

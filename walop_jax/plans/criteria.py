@@ -48,8 +48,8 @@ TARGET_GRID = 9  # field points along each axis at which the error of p is asked
 class Criterion:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
-    `unit` is that of the root of the largest variance, after `scale`; `what` describes it. `inverse`: its
-    reciprocal is given, in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair
+    `unit` is that of the root of the largest variance; `what` describes it. `inverse`: its reciprocal is given, in
+    standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair
     to those of the candidates; targets are then one after the other for the pairs of each draw.
     """
 
@@ -57,18 +57,17 @@ class Criterion:
     what: str
     unit: str
     targets: Float[np.ndarray, "r k f q"]
-    scale: float = 1.0
     inverse: bool = False
     blocks: Float[np.ndarray, "b f n"] | None = None
 
     def reported(self, variance: float) -> float:
         """The number that is given for a value of the criterion."""
-        root = self.scale * float(np.sqrt(variance))
+        root = float(np.sqrt(variance))
         return 1.0 / root if self.inverse else root
 
-    def variance(self, told: float) -> float:
+    def variance(self, reported: float) -> float:
         """The value of the criterion for a number that is given."""
-        return float(((1.0 / told if self.inverse else told) / self.scale) ** 2)
+        return float((1.0 / reported if self.inverse else reported) ** 2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,41 +124,26 @@ def field_errors(
 
     `stars` (q, u) are those over which the square is averaged, at all points or at each: those with p ≤ 5 %.
     """
-    plan = found.available.plan
+    model, plan, draws = found.model, found.available.plan, len(found.values)
     edge = np.linspace(-plan.field, plan.field, TARGET_GRID)
     x, y = (np.tile(edge, TARGET_GRID), np.repeat(edge, TARGET_GRID)) if points is None else points
     light = sample_stars() if stars is None else stars
-    results = [_at(found, values, x, y, light, colours) for values in found.values]
-    slopes, forms = (np.stack(arrays) for arrays in zip(*results, strict=True))
-    repeated = len(colours) * len(plan.filters)
-    return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), slopes, forms)
-
-
-def _at(
-    found: Candidates,
-    values: Float[np.ndarray, " n"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-    stars: Float[np.ndarray, "*b m 2"],
-    colours: Sequence[float],
-) -> tuple[Float[np.ndarray, "t 6 f"], Float[np.ndarray, "t 6 6"]]:
-    model, plan = found.model, found.available.plan
-    instrument, select = model.instrument(values), model.selection()
-    slopes, forms = [], []
-    for name in plan.filter_names:
-        for teff in colours:
-            setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
-            m, slope = matrix_slopes(instrument, setting, plan.curves(), x, y)
-            if m.shape[1] != 2:
-                raise ValueError(
-                    f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
-                    f"observed; plan for a parameter instead, such as --criterion {found.names[0]}"
-                )
-            form = p_forms(m.reshape(len(x), 6), stars)
-            square = np.einsum("pni,pnj->pij", form, form) / form.shape[1]
-            forms.append(np.where(measures_u(m)[:, None, None], square, 0.0))
-            slopes.append(slope.reshape(len(x), 6, -1) @ select)
-    return np.concatenate(slopes), np.concatenate(forms)
+    slopes, forms, select = [], [], model.selection()
+    for values, name, teff in itertools.product(found.values, plan.filter_names, colours):
+        setting = dataclasses.replace(Settings.default(1, name), teff=np.array([teff]))
+        m, slope = matrix_slopes(model.instrument(values), setting, plan.curves(), x, y)
+        if m.shape[1] != 2:
+            raise ValueError(
+                f"{plan.name} does not measure q and u in one exposure: the error of p depends on how stars are "
+                f"observed; plan for a parameter instead, such as --criterion {found.names[0]}"
+            )
+        form = p_forms(m.reshape(len(x), 6), light)
+        square = np.einsum("pni,pnj->pij", form, form) / form.shape[1]
+        forms.append(np.where(measures_u(m)[:, None, None], square, 0.0))
+        slopes.append(slope.reshape(len(x), 6, -1) @ select)
+    repeated = len(slopes) // draws  # filters and colours
+    by_draw = (np.stack(arrays).reshape(draws, -1, *arrays[0].shape[1:]) for arrays in (slopes, forms))
+    return FieldErrors(np.tile(x, repeated), np.tile(y, repeated), *by_draw)
 
 
 def criterion_by_name(found: Candidates, field: FieldErrors | None, criterion: str | InputTable) -> Criterion:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -55,6 +55,8 @@ GRID, STAR_GRID = 6, 3
 """Field points along each axis at which the information is computed, scaled to those of the plan."""
 DRAWS = 20
 _BETWEEN = 60  # places at which the series of a gain are held against the information itself
+Counts = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
+"""Counts of light of unit flux, and their derivatives to the free parameters."""
 _AT_ONCE = (36, 1)  # field points, with one angle and with two: arrays stay small
 _ROUNDING = 1e-10  # of the largest eigenvalue
 
@@ -126,8 +128,9 @@ def candidates(
     kinds = (*catalogue, *(effect.kind for effect in effects if isinstance(effect, Effect)))
     model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
     values = drawn(model, draws, seed, around)
-    for i in (model.index(name) for name in model.names if _effect_of(name, stated)):
-        values[:, i] = model.parameters[i].start
+    for i, p in enumerate(model.parameters):
+        if p.part in stated:
+            values[:, i] = p.start
     likelihood = Likelihood.of(calset, model)
     factor, flux = _factor(available.plan, few), simulation.fluxes(plan, None)
     exptime = plan.exposures().exptime
@@ -139,29 +142,33 @@ def candidates(
     for number, draw in enumerate(values, start=1):
         tell(f"expected counts of instrument {number} of {draws}")
         responses.append(_responses(likelihood, draw))
+
+    def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[Counts, ...]]:
+        """The light of some exposures of a choice, and their counts in every draw."""
+        at, star = likelihood.used[:, rows.start], choice.kind == "standard"
+        electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
+        scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
+        scale, of_stars = 1.0 if star else factor, dict.fromkeys(means, scatter)
+        lit = Illumination(electrons, noise, floor, shared, scale, of_stars)
+        return lit, tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
+
     families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
         tell(f"information of {choice.text()}")
-        cost, matrices = choice.seconds + available.costs.of(choice.kind), []
-        polarised = choice.kind == "clp"
-        for rows in [slice(start, stop)] if polarised else [slice(i, i + 1) for i in range(start, stop)]:
-            at = likelihood.used[:, rows.start]
-            electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-            star = choice.kind == "standard"
-            scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
-            scale, of_stars = 1.0 if star else factor, dict.fromkeys(means, scatter)
-            light = Illumination(electrons, noise, floor, shared, scale, of_stars)
-            counts = tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
-            if polarised:
-                families.append(Polarised(choice, light, counts, _orders(choice, angles), cost))
-            else:
-                matrices.append(np.stack([light.information(*draw)[0] for draw in counts]))
-        if matrices:
-            families.append(Listed.of(np.stack(matrices, axis=1), cost))
+        cost = choice.seconds + available.costs.of(choice.kind)
+        if choice.kind == "clp":
+            lit, counts = seen(choice, slice(start, stop))
+            families.append(Polarised(choice, lit, counts, _orders(choice, angles), cost))
+            continue
+        matrices = []
+        for row in range(start, stop):
+            lit, counts = seen(choice, slice(row, row + 1))
+            matrices.append(np.stack([lit.information(*draw)[0] for draw in counts]))
+        families.append(Listed.of(np.stack(matrices, axis=1), cost))
     lost = max([0.0, *(f.lost() for f in families if isinstance(f, Polarised))])
     rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
-    base = np.array([not _effect_of(name, stated) for name in names])
+    base = np.array([model.parameters[i].part not in stated for i in model.free])
     prior = (rows.T @ rows) * np.outer(base, base)
     return Candidates(available, model, choices, tuple(families), values, names, prior, lost, notes, stated)
 
@@ -184,16 +191,11 @@ def _with(
             raise ValueError(f"{what}; leave it out")
         stated[name] = not alone
         for p in extended.parameters if alone else ():
-            if _effect_of(p.name, (name,)) and p.name.split(".")[1] not in kind.shape:
+            if p.part == name and p.name.split(".")[1] not in kind.shape:
                 extended = extended.change(p.name, start=p.start + p.scale)
     if given and not light.is_linear(extended.template):
         raise ValueError("effects of the detectors cannot be planned for: only those that act on light")
     return extended, stated
-
-
-def _effect_of(name: str, effects: Iterable[str]) -> str:
-    """The effect that a parameter belongs to, of some."""
-    return next((effect for effect in effects if name.startswith(f"{effect}.")), "")
 
 
 def fewer_points(plan: ObservingPlan) -> ObservingPlan:
@@ -215,25 +217,19 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
     for draw in range(draws):
         rng = np.random.default_rng([seed, draw])
         truth = simulation.truth_values(simulation.draw_instrument(model, rng))
-        values = np.array([truth[name] for name in model.names])
         if around is not None:
             of = around.model
             covariance = around.covariance[np.ix_(of.free, of.free)]
             normal = rng.multivariate_normal(np.zeros(len(of.free)), covariance, method="eigh")
-            deviation = of.selection() @ normal
-            for i, name in enumerate(model.names):
-                if name in of.names:
-                    values[i] = around.values[of.index(name)] + deviation[of.index(name)]
-        samples.append(values)
-    return np.stack(samples)
+            truth |= dict(zip(of.names, around.values + of.selection() @ normal, strict=True))
+        samples.append([truth[name] for name in model.names])
+    return np.array(samples, float)
 
 
 _unit_at = compiled(jax.vmap(engine.unit_slopes, (None, None, 0)), kept_as="unit_counts")
 
 
-def _responses(
-    likelihood: Likelihood, values: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]:
+def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Counts:
     """Counts for light of unit flux, and their derivatives to the free parameters."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
     batches = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
@@ -281,16 +277,13 @@ class Illumination(NamedTuple):
     scale: float
     scatter: Mapping[int, float] = MappingProxyType({})
 
-    def sigma(self, counts: Float[np.ndarray, "p a b"], cameras: int) -> Float[np.ndarray, "p a b"]:
-        """Standard errors of counts; `cameras` is the axis of these."""
-        return with_floor(self.noise.sigma(counts), counts, self.floor, cameras)
-
     def information(
         self, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"]
     ) -> Float[np.ndarray, "s f f"]:
         """JᵀJ of exposures, from counts of unit flux and their derivatives."""
         flux = self.flux[:, None, None]
-        weight = 1.0 / self.sigma(flux * unit, 2)
+        counts = flux * unit
+        weight = 1.0 / with_floor(self.noise.sigma(counts), counts, self.floor, 2)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
         if any(self.scatter.values()):
@@ -308,8 +301,8 @@ class Illumination(NamedTuple):
         Without the flux, with w = flux / σ and along a = unit / σ: Σ w_k² s_k G s_k − Σ (w a)_k (w a)_l s_k G s_l /
         Σ a², the sums over cameras with a flux in common (`likelihood.flux`).
         """
-        flux, count = self.flux[:, None, None], unit.shape[1]
-        weight = 1.0 / self.sigma(flux * unit, 1) ** 2
+        counts, count = self.flux[:, None, None] * unit, unit.shape[1]
+        weight = 1.0 / with_floor(self.noise.sigma(counts), counts, self.floor, 1) ** 2
         weighted = unit * weight
         together = np.ones((count, count)) if self.shared.cameras is None else self.shared.cameras
         share = weighted / (together @ (unit * weighted))
@@ -332,7 +325,7 @@ class Polarised(Family):
 
     choice: CandidateExposure
     light: Illumination
-    counts: tuple[tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]], ...]
+    counts: tuple[Counts, ...]
     orders: tuple[int, ...]
     cost: float
     by: Float[np.ndarray, "b f n"] | None = None
@@ -462,12 +455,12 @@ def _mixed(
 
 
 def information_of(
-    known: Calibration, names: Sequence[str], effects: Iterable[str] = ()
+    known: Calibration, names: Sequence[str], effects: Collection[str] = ()
 ) -> Float[np.ndarray, "f f"]:
     """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
-    wanted = [name in known.model.names and not _effect_of(name, effects) for name in names]
-    shared = np.flatnonzero(wanted).tolist()
-    columns = [known.model.index(names[i]) for i in shared]
+    model = known.model
+    shared = [i for i, n in enumerate(names) if n in model.names and model[n].part not in effects]
+    columns = [model.index(names[i]) for i in shared]
     information = np.zeros((len(names), len(names)))
     information[np.ix_(shared, shared)] = pseudo_inverse(known.covariance[np.ix_(columns, columns)], 1e-12)
     return information

@@ -173,7 +173,6 @@ class Allocation:
     value: float
     bound: float
     proof: Bound
-    rounds: int
 
     @property
     def gap(self) -> float:
@@ -209,9 +208,9 @@ class _Some:
         """M(w)⁻¹ of every draw."""
         return np.linalg.inv(self.information(weight))
 
-    def variances(self, covariance: Matrices) -> OfTargets:
+    def variances(self, weight: Weight) -> OfTargets:
         """φ of every target."""
-        return self._by_target(self.wide * (covariance @ self.wide))
+        return self._by_target(self.wide * (self.covariance(weight) @ self.wide))
 
     def _by_target(self, products: Float[np.ndarray, "*l n kq"]) -> Float[np.ndarray, "*l k"]:
         """Sums over the parameters and the columns of each target."""
@@ -227,15 +226,15 @@ class _Some:
             into[:] = matrices.reshape(s, -1) @ (by_target @ by_target.swapaxes(1, 2)).reshape(k, -1).T
         return gains
 
-    def plan(self, weight: Weight, least: float, bound: float, proof: Bound, rounds: int) -> Allocation:
+    def plan(self, weight: Weight, least: float, bound: float, proof: Bound) -> Allocation:
         """The candidates that cost more than `least` with their weights."""
         used = np.flatnonzero(weight * self.costs > least)
         family, place = np.array([self.chosen[i][0] for i in used]), [self.chosen[i][1] for i in used]
-        return Allocation(family, place, weight[used], self.value(weight), bound, proof, rounds)
+        return Allocation(family, place, weight[used], self.value(weight), bound, proof)
 
     def value(self, weight: Weight) -> float:
         """The criterion f(w)."""
-        return float(self.experiment.largest(self.variances(self.covariance(weight))).mean())
+        return float(self.experiment.largest(self.variances(weight)).mean())
 
     def solve(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
         """Weights within `gap` of the best, and the multipliers π of the targets.
@@ -245,13 +244,13 @@ class _Some:
         """
         weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
         weight *= self.experiment.budget / (self.costs @ weight)
-        phi = self.variances(self.covariance(weight))
+        phi = self.variances(weight)
         peak = np.zeros(phi.shape)
         while True:
             peak = np.maximum(peak, self.experiment.relative(phi))
             near = _nearest(peak)
             weight, shares = self._of_targets(near)._solved(weight, gap)
-            phi = self.variances(self.covariance(weight))
+            phi = self.variances(weight)
             top = self.experiment.largest(np.take_along_axis(phi, near, axis=1))
             if np.all(self.experiment.largest(phi) <= (1.0 + 0.1 * gap) * top):
                 multipliers = np.zeros(phi.shape)
@@ -272,7 +271,7 @@ class _Some:
         return subset
 
     def _solved(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
-        phi = self.variances(self.covariance(weight))
+        phi = self.variances(weight)
         constraints = phi.size + len(weight)
         level = self.experiment.largest(phi)
         mu = level.mean() / constraints
@@ -282,7 +281,7 @@ class _Some:
             weight, level = self._centred(weight, level, mu, _ROUGH)
             mu = max(mu / _SHARPER, least)
         weight, level = self._centred(weight, level, mu, _EXACT)
-        slack = self._slack(level, self.variances(self.covariance(weight)))
+        slack = self._slack(level, self.variances(weight))
         return weight, self.experiment.of_one(1.0 / np.maximum(slack, 1e-300))
 
     def _slack(self, level: Levels, phi: OfTargets) -> OfTargets:
@@ -292,7 +291,7 @@ class _Some:
         if np.any(weight <= 0):
             return np.inf
         try:
-            slack = self._slack(level, self.variances(self.covariance(weight)))
+            slack = self._slack(level, self.variances(weight))
         except np.linalg.LinAlgError:
             return np.inf
         if np.any(slack <= 0):
@@ -400,7 +399,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         idle = 0 if better else idle + 1
         best_bound = max(best_bound, bound)
         least = _LEAST_WEIGHT * problem.budget
-        plan = active_problem.plan(weight, least, best_bound, best, turn)
+        plan = active_problem.plan(weight, least, best_bound, best)
         if progress is not None:
             numbers = f"criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
             progress(f"round {turn}: {numbers}")
@@ -492,7 +491,7 @@ def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
         chosen, count, better = _exchanged(chosen, count)
         if not better:
             break
-    return chosen.plan(count, 0.0, plan.bound, plan.proof, plan.rounds)
+    return chosen.plan(count, 0.0, plan.bound, plan.proof)
 
 
 def worth(experiment: Experiment, plan: Allocation) -> tuple[Weight, Weight]:
@@ -514,7 +513,7 @@ def _filled(some: _Some, count: Weight, weight: Weight) -> Weight:
             return count
         # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
         base = count + 1e-3 * weight
-        phi = some.variances(some.covariance(base))
+        phi = some.variances(base)
         value, near = float(some.experiment.largest(phi).mean()), some.worst(phi)
         gain = [(value - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
         count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
@@ -524,7 +523,7 @@ def _exchanged(support: _Some, count: Weight) -> tuple[_Some, Float[np.ndarray, 
     """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
     problem, value = support.experiment, support.value(count)
     covariance = support.covariance(count)
-    phi = support.variances(covariance)
+    phi = support.variances(count)
     # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
     shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
     promising = lower_bound(problem, covariance, shares).tops

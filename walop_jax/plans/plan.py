@@ -317,7 +317,7 @@ Weights = Mapping[tuple[int, tuple[float, ...]], float]  # numbers of exposures,
 def experiment_of(
     found: Candidates, minutes: float, criterion: Criterion, prior: Float[np.ndarray, "f f"] | None = None
 ) -> Experiment:
-    """The problem of a budget in minutes; `known` is added to the prior."""
+    """The problem of a budget in minutes; `prior` is information beside that of the candidates' own prior."""
     before = found.prior if prior is None else found.prior + prior
     families, pairs, budget = found.families, criterion.blocks, 60.0 * minutes
     if pairs is None:
@@ -388,29 +388,26 @@ def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tu
 
 
 def _within(
-    found: Candidates, experiment: Experiment, weights: Allocation, allowed: Any
+    found: Candidates, experiment: Experiment, weights: Allocation, allowed: Sequence[int]
 ) -> tuple[Allocation, list[Line]]:
     """Whole exposures of some choices, with their changes."""
-    allowed, budget, changes = list(allowed), experiment.budget, 0.0
     at = [i for i, family in enumerate(weights.family) if family in allowed]
     if not at:
         raise ValueError("none of the best exposures is left")
+    budget, changes, place = experiment.budget, 0.0, [weights.place[i] for i in at]
+    families = tuple(experiment.families[i] for i in allowed)
+    family = np.searchsorted(allowed, weights.family[at])
     for _ in range(_TRIES):
         remaining = budget - changes
         if remaining <= 0:
             what = f"changes of filter, moving elements and pointing alone take {changes / 60:.1f}"
             advice = "give more time, or fewer filters and settings"
             raise ValueError(f"{budget / 60:g} minutes: {what}; {advice}")
-        families = tuple(experiment.families[i] for i in allowed)
         problem = dataclasses.replace(experiment, families=families, budget=remaining)
-        family, place = (
-            np.array([allowed.index(weights.family[i]) for i in at]),
-            [weights.place[i] for i in at],
-        )
         weight = weights.weight[at] * remaining / budget
         scaled = dataclasses.replace(weights, family=family, place=place, weight=weight)
         integer = optimal.rounded(problem, scaled)
-        integer = dataclasses.replace(integer, family=np.array([allowed[i] for i in integer.family]))
+        integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
         lines = _ordered(found, integer)
         between = sum(_changes(found, lines))
         if _cost(experiment, integer.weights) + between <= budget * (1 + 1e-9):
@@ -491,13 +488,12 @@ def _described(
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
         stop = choice.stop(line.place)
-        seconds = float(experiment.families[line.choice].cost_at(np.atleast_2d(line.place))[0])
         yield PlannedExposure(
             *(choice.kind, choice.filter, choice.positions),
             polariser_angle=float("nan") if stop.polariser_angle is None else stop.polariser_angle,
             number=stop.number if choice.kind in ("moon", "standard") else -1,
             times=line.times,
-            seconds=line.times * seconds,
+            seconds=_cost(experiment, {(line.choice, line.place): line.times}),
             left_out=float(without[i]),
             one_more=float(added[i]),
             exptime=choice.seconds,
