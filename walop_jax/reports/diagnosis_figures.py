@@ -30,16 +30,46 @@ _MODELS = ("starting\nmodel", "final\nmodel")
 
 @styled
 def residual_maps(
-    points: Points, maps: Mapping[str, PointMap], cameras: Sequence[str], on: Canvas = PAGE
+    points: Points,
+    maps: Mapping[str, PointMap],
+    cameras: Sequence[str],
+    on: Canvas = PAGE,
+    *,
+    rms: bool = False,
 ) -> AnyFigure:
     """Residuals of every field point in the cameras of those names: a row of maps for each entry, one colour scale.
 
     `maps` are (point, camera) by title, NaN where there is nothing. The scale is symmetric about 0; tiles beyond
-    3 σ carry their sign, so that the maps can be read without colours.
+    3 σ carry their sign, so that the maps can be read without colours. Of `rms` residuals it begins at 0.5 σ.
     """
-    far = max(style.largest_size(*maps.values()), SIGN_BEYOND)
-    norm, signs = Normalize(-far, far), len(points) <= MOST_MARKED
-    return _maps(points, maps, cameras, norm, style.DIVERGING, "residual (σ)", signs, on)
+    shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
+    shown = shown if shown.any() else np.ones(len(points), bool)
+    far = max(style.largest_size(*maps.values()), 1.5 if rms else SIGN_BEYOND)
+    norm, colours = (Normalize(0.5, far), "magma_r") if rms else (Normalize(-far, far), style.DIVERGING)
+    signs = not rms and len(points) <= MOST_MARKED
+    size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.4)
+    tiles: Any = None
+    for number, values in enumerate(maps.values()):
+        for k, axis in enumerate(axes[number]):
+            title = cameras[k] if number == 0 else ""
+            tiles = style.point_map(axis, title, points.x, points.y, values[:, k], norm, colours, shown)
+            axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
+            if on.width is not None:
+                axis.tick_params(axis="x", labelrotation=90)
+            axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
+            for i in np.flatnonzero(signs & (np.abs(np.nan_to_num(values[:, k])) > SIGN_BEYOND)):
+                ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
+                look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
+                axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
+    style.outer_labels(axes)
+    for row, title in zip(axes, maps, strict=True):
+        for axis in row:
+            if axis.get_subplotspec().is_first_col():
+                axis.set_ylabel(f"{title}\n\nY (deg)")
+    label = "rms residual (σ)" if rms else "residual (σ)"
+    style.colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
+    return figure
 
 
 @styled
@@ -66,45 +96,7 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     overall = data.comparisons[0].field
     measured = np.isfinite(overall["BEFORE"])
     rms = (np.where(measured, values, np.nan) for values in (overall["RMS_BEFORE"], overall["RMS_AFTER"]))
-    maps: dict[str, PointMap] = dict(zip(_MODELS, rms, strict=True))
-    norm = Normalize(0.5, max(style.largest_size(*maps.values()), 1.5))
-    return _maps(data.points, maps, data.cameras, norm, "magma_r", "rms residual (σ)", False, on)
-
-
-def _maps(
-    points: Points,
-    maps: Mapping[str, PointMap],
-    cameras: Sequence[str],
-    norm: Normalize,
-    colours: str,
-    label: str,
-    signs: bool,
-    on: Canvas,
-) -> AnyFigure:
-    shown = np.any([np.isfinite(values).any(axis=1) for values in maps.values()], axis=0)
-    shown = shown if shown.any() else np.ones(len(points), bool)
-    size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
-    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.4)
-    tiles: Any = None
-    for number, values in enumerate(maps.values()):
-        for k, axis in enumerate(axes[number]):
-            style.field_axes(axis, cameras[k] if number == 0 else "")
-            axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
-            if on.width is not None:
-                axis.tick_params(axis="x", labelrotation=90)
-            axis.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="both"))
-            tiles = style.point_map(axis, points.x, points.y, values[:, k], norm, colours, shown)
-            for i in np.flatnonzero(signs & (np.abs(np.nan_to_num(values[:, k])) > SIGN_BEYOND)):
-                ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
-                look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
-                axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
-    style.outer_labels(axes)
-    for row, title in zip(axes, maps, strict=True):
-        for axis in row:
-            if axis.get_subplotspec().is_first_col():
-                axis.set_ylabel(f"{title}\n\nY (deg)")
-    style.colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
-    return figure
+    return residual_maps(data.points, dict(zip(_MODELS, rms, strict=True)), data.cameras, on, rms=True)
 
 
 @styled
@@ -243,7 +235,6 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
         axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
-    style.field_axes(axis, "largest error that goes undetected")
     percent = 100 * found.protection
     norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
     # Standards lie between the other points: in between the level is interpolated, where one of these is known.
@@ -256,9 +247,8 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
         level = griddata(points[good], np.log(percent[good]), places)
     nearest = KDTree(points).query(places)[1]
     level = np.where(np.isnan(level), np.log(percent[nearest]), level)
-    shown = style.pixel_map(
-        axis, np.where(good[nearest], np.exp(level), np.nan), field, norm, style.SEQUENTIAL
-    )
+    title, values = "largest error that goes undetected", np.where(good[nearest], np.exp(level), np.nan)
+    shown = style.pixel_map(axis, title, values, field, norm, style.SEQUENTIAL)
     style.colour_bar(figure, shown, axis, "error of q, u (%)")
     axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="u not measured in one exposure")
     if not good.all():

@@ -67,9 +67,8 @@ def _before_and_after(
         residual = point_residuals(likelihood, values)
         low, high = (float(edge(residual[shown])) for edge in (np.nanmin, np.nanmax))
         far = high > 3.0
-        style.field_axes(axis, title)
         norm = Normalize(low, high) if far else FITTED
-        image = style.point_map(axis, points.x, points.y, residual, norm, "magma_r", shown)
+        image = style.point_map(axis, title, points.x, points.y, residual, norm, "magma_r", shown)
         style.colour_bar(figure, image, axis, "rms residual (σ)", extend="neither" if far else "both")
 
 
@@ -164,8 +163,8 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
     norm, image = LogNorm(low, max(high, 10 * low)), None
     for axis, errors, name in zip(axes.ravel(), maps.errors, style.element_symbols(maps.arms), strict=True):
         least, highest = (style.plain(100.0 * float(value)) for value in (errors.min(), errors.max()))
-        style.field_axes(axis, f"error of {name}\n{least}–{highest} %")
-        image = style.pixel_map(axis, 100.0 * errors, field_of(maps), norm, style.SEQUENTIAL)
+        title = f"error of {name}\n{least}–{highest} %"
+        image = style.pixel_map(axis, title, 100.0 * errors, field_of(maps), norm, style.SEQUENTIAL)
     style.colour_bar(figure, image, axes, "standard error (%)", pad=0.02, extend="min", aspect=30)
     style.outer_labels(axes)
     return figure
@@ -183,8 +182,8 @@ def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) ->
         axes.ravel(), change, style.element_symbols(new.arms), kinds, strict=True
     ):
         far = style.rounded_up(style.largest_size(change[np.equal(kinds, kind)]))
-        style.field_axes(axis, f"change of {name}")
-        image = style.pixel_map(axis, values, field_of(new), Normalize(-far, far), style.DIVERGING)
+        title, norm = f"change of {name}", Normalize(-far, far)
+        image = style.pixel_map(axis, title, values, field_of(new), norm, style.DIVERGING)
         style.colour_bar(figure, image, axis, "new − old (%)" if axis in axes[:, -1] else "")
     style.outer_labels(axes)
     return figure
@@ -202,8 +201,8 @@ def residual_map_figure(residuals: ResidualMap, cameras: Sequence[str], on: Canv
     figure, axes = on.panels(9.4, 2.0 * arms, arms, 4, turned=True, squeeze=False)
 
     def draw(axis: Axes, title: str, values: Float[np.ndarray, "y x"], norm: Normalize, colours: str) -> None:
-        style.field_axes(axis, title)
-        style.colour_bar(figure, style.pixel_map(axis, values, field_of(residuals), norm, colours), axis)
+        image = style.pixel_map(axis, title, values, field_of(residuals), norm, colours)
+        style.colour_bar(figure, image, axis)
 
     far = 100.0 * _almost_largest(elements)
     for axis, values, name in zip(axes[:, :3].ravel(), elements, style.element_symbols(arms), strict=True):
@@ -240,9 +239,8 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure, (left, right) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))
     low, high = float(percent.min()), float(percent.max())
-    style.field_axes(left, f"error of p (%), {accuracy.filter}")
-    norm = LogNorm(0.003, _RANGE[1])
-    image = style.pixel_map(left, percent, accuracy.extent, norm, style.SEQUENTIAL, smooth=True)
+    title, norm = f"error of p (%), {accuracy.filter}", LogNorm(0.003, _RANGE[1])
+    image = style.pixel_map(left, title, percent, accuracy.extent, norm, style.SEQUENTIAL, smooth=True)
     style.colour_bar(figure, image, left, extend="both")
     if low < goal < high:
         fine = 10.0 ** zoom(np.log10(percent), 4, order=1)
@@ -274,10 +272,10 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
     figure, axes = on.panels(8.2, 3.6, 1, 2, sharey=True)
     lowest, highest = float(0.5 * np.nanmin(maps[1])), float(2.0 * np.nanmax(maps[1]))
     highest = min(max(float(np.nanmax(maps[0])), highest), max(_RANGE[1], highest))
-    for axis, values, title in zip(axes, maps, ("before", "after"), strict=True):
-        style.field_axes(axis, f"error of p {title}")
+    norm = LogNorm(lowest, highest)
+    for axis, values, when in zip(axes, maps, ("before", "after"), strict=True):
         shown = np.minimum(values, highest)
-        image = style.point_map(axis, places[0], places[1], shown, LogNorm(lowest, highest), style.SEQUENTIAL)
+        image = style.point_map(axis, f"error of p {when}", *places, shown, norm, style.SEQUENTIAL)
         blind = np.isnan(values)
         axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
     style.colour_bar(figure, image, axes, "error of p (%)", extend="max", pad=0.02)

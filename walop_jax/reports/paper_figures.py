@@ -45,12 +45,10 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
         along = np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0)
         smooth = np.unwrap(along, axis=0, period=360.0)
         smooth -= 360.0 * np.floor(smooth[_PIXELS // 2, _PIXELS // 2] / 360.0)
-        style.field_axes(axis, f"{style.PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm")
+        title = f"{style.PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm"
         norm = Normalize(float(smooth.min()), float(smooth.max()))
-        label = "retardance (deg)" if axis is axes[0, -1] else ""
-        style.colour_bar(
-            figure, style.pixel_map(axis, smooth, calibration.field, norm, style.SEQUENTIAL), axis, label
-        )
+        image = style.pixel_map(axis, title, smooth, calibration.field, norm, style.SEQUENTIAL)
+        style.colour_bar(figure, image, axis, "retardance (deg)" if axis is axes[0, -1] else "")
         look = {"colors": "w", "linewidths": 0.5, "negative_linestyles": "solid"}
         lines = axis.contour(smooth, extent=calibration.field, levels=6, **look)
         axis.clabel(lines, fontsize=style.SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
@@ -108,7 +106,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
     figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
-            style.field_axes(axis, f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}")
+            title = f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}"
             # Where an exposure holds no u a few are larger by orders of magnitude.
             median = float(np.median(values))
             spread = 5.0 * 1.4826 * float(np.median(np.abs(values - median))) or 1.0
@@ -117,7 +115,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
             if both_signs:
                 low, high = -max(-low, high), max(-low, high)
             colours = style.DIVERGING if both_signs else style.SEQUENTIAL
-            shown = style.point_map(axis, fits.x, fits.y, values, Normalize(low, high), colours)
+            shown = style.point_map(axis, title, fits.x, fits.y, values, Normalize(low, high), colours)
             style.colour_bar(figure, shown, axis, extend="both")
     style.outer_labels(axes)
     return figure
@@ -198,14 +196,14 @@ def histogram_figure(comparison: Comparison) -> Figure:
 def map_figure(comparison: Comparison) -> Figure:
     """Maps of the errors of q and u of both methods, on the grid points and between them, a tile for each point."""
     figure, axes = PAGE.panels(10.4, 5.0, 2, 4, sharex=True, sharey=True)
-    shown = None
+    norm, shown = LogNorm(2e-3, 2.0), None
     for row, k in zip(axes, (0, 1), strict=True):
         panels = [(place, m) for place in (comparison.grid, comparison.between) for m in ("paper", "joint")]
         for axis, (place, method) in zip(row, panels, strict=True):
             where = "on the grid" if place is comparison.grid else "between"
-            style.field_axes(axis, f"{QUANTITIES[k]}, {_NAMES[method].partition(',')[0]}, {where}")
+            title = f"{QUANTITIES[k]}, {_NAMES[method].partition(',')[0]}, {where}"
             percent = 100 * getattr(place, method)[:, k]
-            shown = style.point_map(axis, place.x, place.y, percent, LogNorm(2e-3, 2.0), style.SEQUENTIAL)
+            shown = style.point_map(axis, title, place.x, place.y, percent, norm, style.SEQUENTIAL)
     style.outer_labels(axes)
     style.colour_bar(figure, shown, axes, "rms error (%)", pad=0.01, shrink=0.8, extend="both")
     return figure
@@ -271,9 +269,8 @@ def plate_figure(
     for axis, plates in zip(axes[0], combinations, strict=True):
         settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
         worst = plate_errors(analysis, settings, x, y).reshape(_PLATE_PIXELS, _PLATE_PIXELS)
-        shown = style.pixel_map(axis, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
-        names = ["out" if plate is None else f"{plate:g}°" for plate in plates]
-        style.field_axes(axis, "plate " + " and ".join(names))
+        title = "plate " + " and ".join("out" if plate is None else f"{plate:g}°" for plate in plates)
+        shown = style.pixel_map(axis, title, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
     style.outer_labels(axes)
     style.colour_bar(figure, shown, axes, "error / ideal instrument", pad=0.02)
     return figure

@@ -208,7 +208,7 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
     return draw
 
 
-def field_axes(axis: Axes, title: str = "") -> None:
+def _field_axes(axis: Axes, title: str) -> None:
     """Make axes a map of the field."""
     axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
     axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
@@ -235,9 +235,10 @@ def outer_labels(axes: Any) -> None:
 
 
 def pixel_map(
-    axis: Axes, values: Map, field: Field, norm: Normalize, colours: str, *, smooth: bool = False
+    axis: Axes, title: str, values: Map, field: Field, norm: Normalize, colours: str, *, smooth: bool = False
 ) -> Any:
     """A map whose outermost pixels have their centres on the edges of `field` (left, right, bottom, top; degrees)."""
+    _field_axes(axis, title)
     low_x, high_x, low_y, high_y = field
     height, width = values.shape
     half_x, half_y = 0.5 * (high_x - low_x) / max(width - 1, 1), 0.5 * (high_y - low_y) / max(height - 1, 1)
@@ -251,6 +252,7 @@ def pixel_map(
 
 def point_map(
     axis: Axes,
+    title: str,
     x: Places,
     y: Places,
     values: Places,
@@ -259,6 +261,7 @@ def point_map(
     shown: Bool[np.ndarray, " p"] | None = None,
 ) -> Any:
     """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges."""
+    _field_axes(axis, title)
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
     visible = shown & np.isfinite(values)
@@ -419,8 +422,8 @@ def matrix_panels(
         kind = element_kind(i, arms)
         low, high = (100.0 * float(edge(maps[i])) for edge in (np.min, np.max))
         span = f"{_short(low, high - low)} to {_short(high, high - low)} %"
-        field_axes(axis, f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}")
-        image = pixel_map(axis, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth)
+        title = f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}"
+        image = pixel_map(axis, title, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth)
         colour_bar(figure, image, axis)
         if weak is not None and i > 3 and weak.min() < SMALLEST_DETERMINANT < weak.max():
             axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=field, colors="0.15", linewidths=0.7)
