@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of
-from walop_jax.commands.each import for_each
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of, several
 from walop_jax.commands.gather import gather
 from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
-from walop_jax.io.errors import errors_naming
+from walop_jax.io.errors import DataError, errors_naming
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -93,7 +94,7 @@ def apply(
             "calibration": calibration, "debias": debias, "saturation": saturation, "posterior": posterior,
             "effects": effects, "force": force, "common": common,
         }  # fmt: skip
-        return for_each(job, apply, catalogue, output, options, workers, scheduler)
+        return _apply_to_each(job, several(catalogue), output, options, workers, scheduler)
     if output is not None:
         check_output(output, overwrite=job.overwrite)
         table_format(output)
@@ -168,3 +169,62 @@ def calibration_for(
     if is_survey(given):
         return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
     return calibration_of(given, effects)
+
+
+def _apply_to_each(
+    job: Job,
+    files: Sequence[Any],
+    output: PathLike | None,
+    options: Mapping[str, Any],
+    workers: int | None,
+    scheduler: str | Executor | None,
+) -> Outcome[list[Path]]:
+    """`apply` with `options` for each file, here or by the workers of an executor: the paths of all tables in a folder.
+
+    A table appears whole or not at all, and one that is there is not made again: the same command goes on with what an
+    interrupted one has left. Errors of a file fail the whole, which names them, after all others are made.
+    """
+    from walop_jax.nights.making import executor_of, mapped
+
+    if output is None:
+        raise UsageError("a folder for the tables is wanted", "output")
+    if not all(isinstance(file, str | os.PathLike) for file in files):
+        raise UsageError("tables in memory are reduced one by one; give the paths of files", "each")
+    places = [Path(output) / Path(file).name for file in files]
+    if len({place.name for place in places}) < len(places):
+        raise UsageError("two catalogues have the same name, and so would their tables", "each")
+    if any(place.resolve() == Path(file).resolve() for place, file in zip(places, files, strict=True)):
+        raise UsageError("the tables would replace the catalogues: give another folder", "output")
+    Path(output).mkdir(parents=True, exist_ok=True)
+    pairs = [p for p in zip(files, places, strict=True) if job.overwrite or not p[1].exists()]
+    calls = [(job.overwrite, {**options, "catalogue": file, "output": place}) for file, place in pairs]
+    ended, warnings = [], []
+    with executor_of(workers, scheduler) as executor:
+        for number, outcome in enumerate(mapped(_applied, calls, executor), start=1):
+            job.tell(f"{number} of {len(calls)} catalogues")
+            ended.append(outcome)
+            warnings += outcome.warnings
+    failed = [outcome.failure for outcome in ended if outcome.failure]
+    if existing := len(files) - len(calls):
+        what = f"{existing} of {len(files)} tables were there already"
+        warnings.append(f"{what}, and are left; --overwrite makes them again")
+    document = {"outputs": [str(place) for place in places], "made": len(ended) - len(failed)}
+    document |= {"left": existing, "failed": failed}
+    document["catalogues"] = [outcome.content for outcome in ended if not outcome.failure]
+    text = "\n".join(outcome.text for outcome in ended if outcome.text) or f"{output}: nothing was left to do"
+    return Outcome(places, document, text, warnings=list(dict.fromkeys(warnings)), failure="; ".join(failed))
+
+
+def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:
+    """The outcome of one `apply` (overwrite or not, arguments), in any process; without the table."""
+    import walop_jax
+    from walop_jax.model.compiled import float64
+
+    overwrite, arguments = call
+    try:
+        with float64():
+            outcome = command_of(walop_jax.apply).run(Job(overwrite=overwrite), dict(arguments))
+    except (DataError, UsageError) as error:
+        return Outcome(None, {}, "", failure=str(error))
+    text, content = outcome.printed(), outcome.content
+    return Outcome(None, content, text, warnings=outcome.warnings, failure=outcome.failure)

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
+from walop_jax.io.names import COMMISSIONING
 
 if TYPE_CHECKING:
     from walop_jax.science.commissioning import Certificate
 
-DOCUMENT = "commissioning.json"
 
-
-@command(writes=(DOCUMENT,))
+@command(writes=(COMMISSIONING,))
 def certify(
     job: Job, calibration: Product, effects: Effects = None, *, output: PathLike | None = None
 ) -> Outcome[Certificate]:
@@ -68,4 +67,4 @@ def certify(
     certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
     failed = ", ".join(check.name for check in certificate.failed)
     failure = failed and f"{path}: not valid: {failed}"
-    return Outcome(certificate, saved_as=DOCUMENT, failure=failure, trusted=certificate.go)
+    return Outcome(certificate, saved_as=COMMISSIONING, failure=failure, trusted=certificate.go)

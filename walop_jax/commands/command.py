@@ -16,13 +16,13 @@ import inspect
 import io
 import json
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+from walop_jax.io.errors import PathLike
 from walop_jax.io.progress import Stage, repeated
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ T = TypeVar("T")
 Tell = Callable[[str], None]
 Writers = Mapping[str, Callable[[Path], object] | None]
 """Writers of files by name; None: this result has no such file."""
-PathLike = str | os.PathLike[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,10 +85,6 @@ class UsageError(ValueError):
         self.option = option
 
 
-def _silent(text: str) -> None:
-    pass
-
-
 @dataclasses.dataclass(frozen=True)
 class Job:
     """Working conditions of a command, apart from its own arguments.
@@ -100,7 +95,7 @@ class Job:
 
     overwrite: bool = False
     seed: int = 0
-    progress: Tell = _silent
+    progress: Tell = lambda text: None
     folder: OutputFolder | None = None
     typed: bool = False
     began: float = dataclasses.field(default_factory=time.perf_counter)
@@ -123,7 +118,7 @@ class Job:
         return repeated(self.progress)
 
     @contextlib.contextmanager
-    def reserved(self, output: str | os.PathLike[str] | None, names: Sequence[str]) -> Iterator[Job]:
+    def reserved(self, output: PathLike | None, names: Sequence[str]) -> Iterator[Job]:
         """The job with the folder `output` reserved for the files `names` (None: nothing is written)."""
         if output is None:
             yield self
@@ -319,11 +314,12 @@ class Command(Generic[T]):
 
             arguments = self.bound(args, kwargs)
             shared = {name: arguments.pop(name) for name in COMMON if name in arguments}
-            tell = shared["progress"] or _silent
+            tell = shared["progress"]
 
             def logged(text: str) -> None:
                 LOG.info("%s", text)
-                tell(text)
+                if tell is not None:
+                    tell(text)
 
             shared["progress"] = logged
             with float64():

@@ -165,12 +165,12 @@ def _command(name: str) -> Any:
 
 def _function(command: Command[Any]) -> Callable[..., None]:
     """Function that typer calls: its signature is made of the options of a command."""
-    defaults = {p.name: p.default for p in inspect.signature(command.body).parameters.values()}
-    defaults["elements"] = None
-    parameters = [_parameter(name, option, defaults[name]) for name, option in command.options.items()]
-    for name, (default, _, option) in COMMON.items():
-        if option is not None and (name != "overwrite" or command.writes is not None):
-            parameters.append(_parameter(name, option, default, name == "seed" and not command.random))
+    options = command.options | {name: option for name, (*_, option) in COMMON.items() if option is not None}
+    parameters = [
+        _parameter(name, options[name], p.default, hidden=name == "seed" and not command.random)
+        for name, p in command.signature.parameters.items()
+        if name in options
+    ]
     parameters += [_parameter("quiet", QUIET, False), _parameter("json", JSON, False)]
 
     def run(**given: Any) -> None:

@@ -61,39 +61,31 @@ def report(
 
     >>> walop.report(result, "page.html")  # doctest: +SKIP
     """
-    from walop_jax import FitResult
+    from walop_jax import FitResult, Run
     from walop_jax.commands.diagnose import write
-
-    if isinstance(fit_of(run), FitResult):
-        if output is None:
-            raise UsageError("give output, the folder for the page of a fit in memory", "output")
-        with tempfile.TemporaryDirectory() as temporary:
-            written: Any = save if isinstance(run, FitResult) else write
-            written(run, Path(temporary) / "fit")
-            return _page(job, Path(temporary) / "fit", Path(output), effects=effects, goal=goal)
-    folder = folder_of(run)  # pyright: ignore[reportArgumentType]
-    target = folder / PAGE if output is None else Path(output)
-    return _page(job, folder, target, data, effects, goal)
-
-
-def _page(
-    job: Job, folder: Path, target: Path, data: Any = (), effects: Effects = None, goal: float | None = None
-) -> Outcome[Page]:
-    """Write the page about a folder."""
-    from walop_jax import Run
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
-    job.begin("reading")
-    kind = kind_of_run(folder)
-    contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
-    overwrite = job.overwrite or _is_page(target)
-    check_output(target, overwrite=overwrite)
-    job.tell("drawing", "drawing")
-    text, missing = render_other(folder, kind) if contents is None else render(contents, goal_of(goal))
-    text = encodable(text)
+    with tempfile.TemporaryDirectory() as scratch:
+        if isinstance(fit_of(run), FitResult):
+            if output is None:
+                raise UsageError("give output, the folder for the page of a fit in memory", "output")
+            folder, data = Path(scratch) / "fit", ()
+            written: Any = save if isinstance(run, FitResult) else write
+            written(run, folder)
+        else:
+            folder = folder_of(run)  # pyright: ignore[reportArgumentType]
+        target = folder / PAGE if output is None else Path(output)
+        job.begin("reading")
+        kind = kind_of_run(folder)
+        contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
+        overwrite = job.overwrite or _is_page(target)
+        check_output(target, overwrite=overwrite)
+        job.tell("drawing", "drawing")
+        page = render_other(folder, kind) if contents is None else render(contents, goal_of(goal))
+    text, missing = encodable(page[0]), page[1]
     with atomic_path(target, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return Outcome(Page(target, len(text.encode()), missing))
