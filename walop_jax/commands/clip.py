@@ -9,7 +9,7 @@ from walop_jax.commands.command import Job, Outcome, PathLike, command
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model
 from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, repeated
 
 if TYPE_CHECKING:
     from walop_jax.fit.outliers import Clipped
@@ -51,7 +51,7 @@ def clip(
         where = calset.inputs[0].path if calset.inputs else IN_MEMORY
         advice = "only tables of intensities can; of frames the reduction flags cosmic rays, in FLAG"
         raise fail("cannot be clipped", file=where, advice=advice)
-    with job.repeated() as say:
+    with repeated(job.progress) as say:
         say(Stage("fitting", "fitting"))
         flagged = clipped(calset, chosen, sigma)
         # Of too many rows the model lacks something: no need to ask what.

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.io.errors import PathLike
-from walop_jax.io.progress import Stage, repeated
+from walop_jax.io.progress import Stage
 
 if TYPE_CHECKING:
     from walop_jax.io.display import Display
@@ -112,10 +112,6 @@ class Job:
     def seconds(self) -> float:
         """The time since the command began."""
         return time.perf_counter() - self.began
-
-    def repeated(self) -> contextlib.AbstractContextManager[Tell]:
-        """`progress`, told again where nothing new can be said for long."""
-        return repeated(self.progress)
 
     @contextlib.contextmanager
     def reserved(self, output: PathLike | None, names: Sequence[str]) -> Iterator[Job]:
@@ -218,15 +214,10 @@ class Outcome(Generic[T]):
         return self
 
 
-ELEMENTS = Option("Kinds of elements of your own; see walop-jax docs adding-an-instrument.", "FILE.py", Path)
-"""Of every command that reads instruments, runs or models: of the commands that take effects of one's own."""
-
-COMMON: Mapping[str, tuple[Any, Any, Option | None]] = {
-    "overwrite": (False, bool, Option("Replace outputs that exist.")),
-    "progress": (None, Callable[[str], None] | None, None),
-    "seed": (0, int, Option("Seed of random numbers (default: 0).", kind=int)),
-}
-"""The parameters that every command takes in Python, with their defaults, kinds and options."""
+COMMON: Mapping[str, tuple[Any, Any]] = {
+    "overwrite": (False, bool), "progress": (None, Callable[[str], None] | None), "seed": (0, int),
+}  # fmt: skip
+"""The parameters that every command takes in Python, with their defaults and kinds."""
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
 IN_THE_MODEL = "that is a matter of the model: model=base_model(calset).change('half1.wedge', free=False)"
@@ -255,6 +246,7 @@ class Command(Generic[T]):
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
     `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
+    `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
     """
 
     body: Callable[..., Outcome[T]]
@@ -266,25 +258,22 @@ class Command(Generic[T]):
 
     def __post_init__(self) -> None:
         self.name = self.body.__name__
-        self.own, self.options = [], {}
         options = options_of_commands()
-        options = {**options["*"], **options.get(self.name, {})}
-        for p in list(inspect.signature(self.body).parameters.values())[1:]:
-            self.own.append(p.replace(annotation=_kind(self.body, p)))
-            self.options |= {p.name: options[p.name]} if p.name in options else {}
-        self.elements |= "effects" in self.options
-        if self.elements:
-            self.options["elements"] = ELEMENTS
+        self.described = {**options["*"], **options.get(self.name, {})}
+        parameters = list(inspect.signature(self.body).parameters.values())[1:]
+        self.own = [p.replace(annotation=_kind(self.body, p)) for p in parameters]
+        self.elements |= "effects" in (p.name for p in self.own)
+        names = [p.name for p in self.own] + ["elements"] * self.elements
+        self.options = {name: self.described[name] for name in names if name in self.described}
 
     @functools.cached_property
     def signature(self) -> inspect.Signature:
         """The signature of the Python function: its own arguments, then those that all commands share."""
-        shared = {"elements": (None, PathLike | Sequence[type] | None, ELEMENTS), **COMMON}
+        shared = {"elements": (None, PathLike | Sequence[type] | None), **COMMON}
         absent = {"elements": not self.elements, "overwrite": self.writes is None}
-        given = {name: entry for name, entry in shared.items() if not absent.get(name)}
         make = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        added = (make(name, default=default, annotation=kind) for name, (default, kind, _) in given.items())
-        return inspect.Signature([*self.own, *added])
+        added = (make(name, default=default, annotation=kind) for name, (default, kind) in shared.items())
+        return inspect.Signature([*self.own, *(p for p in added if not absent.get(p.name))])
 
     def bound(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for others."""

@@ -10,6 +10,7 @@ from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, comma
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
+from walop_jax.io.progress import repeated
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def diagnose(
         raise UsageError("Missing option '--output' / '-o'.", "output")
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
-    with job.repeated() as say:
+    with repeated(job.progress) as say:
         diagnosis = diagnosis_of(calset, chosen, seed=job.seed, minutes=minutes, progress=say)
     return outcome_of(job, diagnosis, output)
 

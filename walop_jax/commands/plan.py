@@ -14,6 +14,7 @@ from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, comma
 from walop_jax.commands.products import Effects, calibration_of, catalogue_of
 from walop_jax.commands.standards import LOWEST
 from walop_jax.io.errors import fail
+from walop_jax.io.progress import repeated
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, ObservingPlan, Run
@@ -87,7 +88,7 @@ def plan(
     possible = Available.of(available)  # pyright: ignore[reportArgumentType]
     job.tell("information of exposures", "information")
     possible = possible if schedule is None else possible.in_whole_seconds()
-    with job.repeated() as say:
+    with repeated(job.progress) as say:
         best = functools.partial(
             plan_exposures, minutes=minutes, criterion=chosen, known=prior, goal=goal, draws=draws, apart=alike,
             catalogue=catalogue, seed=job.seed, progress=say,

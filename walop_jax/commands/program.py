@@ -53,9 +53,6 @@ PRINTED = "prints its result and takes no output: keep it with > FILE, with --js
 KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
 INTO_ARGUMENT = "writes into the folder that it is given: leave -o out"
 
-QUIET = Option("Print nothing but warnings and errors.", short="-q", kind=bool)
-JSON = Option("Machine-readable result to stdout, nothing else.", kind=bool)
-
 
 class _Commands(TyperGroup):
     """All commands: their list is a table, the file of one is read when it is asked for."""
@@ -165,13 +162,13 @@ def _command(name: str) -> Any:
 
 def _function(command: Command[Any]) -> Callable[..., None]:
     """Function that typer calls: its signature is made of the options of a command."""
-    options = command.options | {name: option for name, (*_, option) in COMMON.items() if option is not None}
+    options = command.described
     parameters = [
         _parameter(name, options[name], p.default, hidden=name == "seed" and not command.random)
         for name, p in command.signature.parameters.items()
         if name in options
     ]
-    parameters += [_parameter("quiet", QUIET, False), _parameter("json", JSON, False)]
+    parameters += [_parameter(name, options[name], False) for name in ("quiet", "json")]
 
     def run(**given: Any) -> None:
         _guarded(command, given)

@@ -65,7 +65,7 @@ def refit(
     from walop_jax.fit.refit import refit as fit
     from walop_jax.io.atomic import atomic_path, check_output
     from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
-    from walop_jax.io.progress import Stage
+    from walop_jax.io.progress import Stage, repeated
     from walop_jax.io.text import json_text
     from walop_jax.science.field_accuracy import answered
 
@@ -74,7 +74,7 @@ def refit(
     with job.reserved(output, (PRODUCT, SUMMARY)) as job:
         job.begin("reading")
         calset, chosen = inputs.set_and_model(data, model, instrument, effects, output=output)
-        with job.repeated() as say:
+        with repeated(job.progress) as say:
             bytes_of = None if memory is None else memory * inputs.GIGABYTE
             fitted = fit(calset, chosen, progress=say, memory=bytes_of)
             say(Stage("looking for patterns in the residuals", "examining"))

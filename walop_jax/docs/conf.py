@@ -17,7 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import walop_jax
 from walop_jax.commands import COMMANDS
-from walop_jax.commands.command import COMMON, Argument
+from walop_jax.commands.command import Argument
 
 project, author, release = "walop-jax", "The walop-jax developers", walop_jax.__version__
 extensions = ["myst_parser", "sphinx.ext.mathjax"]
@@ -44,7 +44,7 @@ class Commands(SphinxDirective):
             parts += [f"## {name}", f"    walop-jax {name} {' '.join(words)}".rstrip()]
             parts.append(inspect.cleandoc(command.body.__doc__ or ""))
             options = {k: o for k, o in command.options.items() if not isinstance(o, Argument)}
-            options |= {"overwrite": COMMON["overwrite"][2]} if command.writes is not None else {}
+            options |= {"overwrite": command.described["overwrite"]} if command.writes is not None else {}
             if options:
                 rows = [f"| `--{k.replace('_', '-')}` | {o.help} |" for k, o in options.items()]
                 parts.append("\n".join(["| option | meaning |", "| --- | --- |", *rows]))

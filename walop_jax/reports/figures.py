@@ -275,7 +275,8 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
     norm = LogNorm(lowest, highest)
     for axis, values, when in zip(axes, maps, ("before", "after"), strict=True):
         shown = np.minimum(values, highest)
-        image = style.point_map(axis, f"error of p {when}", *places, shown, norm, style.SEQUENTIAL)
+        title = f"error of p {when}"
+        image = style.point_map(axis, title, places[0], places[1], shown, norm, style.SEQUENTIAL)
         blind = np.isnan(values)
         axis.plot(places[0, blind], places[1, blind], "x", color="0.5", ms=4)
     style.colour_bar(figure, image, axes, "error of p (%)", extend="max", pad=0.02)

@@ -150,7 +150,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         head = head if accuracy is None else _with_goal(head, accuracy)
     missing = [*run.missing]
     error_maps = _accuracy_pictures(run, missing) if trusted else ()
-    limits = [] if run.limits is None else [run.limits.display()]
+    limits = () if run.limits is None else (run.limits.display(),)
     limits = [dataclasses.replace(d, title=f"{d.title}: {len(d.rows)} amplitudes") for d in limits]
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
@@ -160,9 +160,9 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         Section("commissioning", "Go or no-go", requirements_shown),
         Section("accuracy", "Accuracy of p over the field", pictures=error_maps),
         Section("data", "The data", Display("", () if run.product is None else data_in_words(run.product))),
-        *([] if diagnosis is None else _diagnosed(run, head, missing)),
+        *([] if diagnosis is None else _diagnosed(run, diagnosis, head, missing)),
         Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
-        *([] if diagnosis is None else [_candidates(run)]),
+        *([] if diagnosis is None else [_candidates(run, diagnosis)]),
         Section("limits", "What these data can show", folded=limits),
         Section("warnings", "Warnings", Display("", notes=_warnings(run) or ("None.",))),
         Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run, missing)),
@@ -211,12 +211,11 @@ def _accuracy(run: RunContents) -> FieldAccuracy | None:
         return None
 
 
-def _with_goal(head: Display, known: FieldAccuracy) -> Display:
+def _with_goal(head: Display, accuracy: FieldAccuracy) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
-    answer = known.facts()
-    replaced = {name for name, _ in answer}
-    unchanged = [fact for fact in head.facts if not fact[0].startswith(("good for", "what to do"))]
-    unchanged = [fact for fact in unchanged if fact[0] not in replaced]
+    answer = accuracy.facts()
+    names, answers = {name for name, _ in answer}, ("good for", "what to do")
+    unchanged = (fact for fact in head.facts if fact[0] not in names and not fact[0].startswith(answers))
     return dataclasses.replace(head, facts=(*answer, *unchanged))
 
 
@@ -237,9 +236,9 @@ def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
         return [] if run.product is None else drawn(run.source, ["residuals"], missing)
     if data is None:
         return []
-    overall, several = data.comparisons[0], len(data.comparisons) > 1
-    if several:
-        names = ["ladder", "rms", "shares"] if len(data.comparisons) > 2 else ["ladder", "shares"]
+    overall, *steps = data.comparisons
+    if steps:
+        names = ["ladder", "rms", "shares"] if len(steps) > 1 else ["ladder", "shares"]
         return drawn(run.source, names, missing)
     residuals = data.points, {"residuals": overall.field["BEFORE"]}, data.cameras
     draw_whole = functools.partial(diagnosis_figures.residual_maps, *residuals)
@@ -260,33 +259,38 @@ def _matrix_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
     return pictures
 
 
-def _diagnosed(run: RunContents, head: Display, missing: list[str]) -> list[Section]:
+def _diagnosed(
+    run: RunContents, diagnosis: Mapping[str, Any], head: Display, missing: list[str]
+) -> list[Section]:
     """Sections on findings, with the figures of every addition."""
-    assert run.diagnosis is not None
-    leftover, data, pictures = run.diagnosis["unexplained"], run.figure_data, []
-    for number, comparison in enumerate(() if data is None else data.comparisons[1:], start=1):
+    comparisons, pictures = () if run.figure_data is None else run.figure_data.comparisons, []
+    for number, comparison in enumerate(comparisons[1:], start=1):
         words = {"effect": comparison.effect, "combination": in_greek(comparison.combination)}
         step = dataclasses.replace(run.source, step=number)
         pictures += drawn(step, ["effect", "signature"], missing, **words)
-    patterns = [] if not leftover else leftover.get("patterns", [])
-    rows = tuple((row["pattern"], probability(row["p_value"]).removeprefix("= ")) for row in patterns)
+    patterns = (diagnosis["unexplained"] or {}).get("patterns", ())
+    rows = tuple((row["pattern"], _chance(row)) for row in patterns)
     shown = dataclasses.replace(head, facts=())
     left = Section("unexplained", "Unexplained patterns", Display("", head=("pattern", ">p"), rows=rows))
     return [Section("found", "Findings", shown, pictures), left]
 
 
-def _candidates(run: RunContents) -> Section:
+def _chance(row: Mapping[str, Any]) -> str:
+    """The p-value of a row, without a sign of equality."""
+    return probability(row["p_value"]).removeprefix("= ")
+
+
+def _candidates(run: RunContents, diagnosis: Mapping[str, Any]) -> Section:
     """Every effect of the catalogue at the first look, limits on effects that were not found."""
-    assert run.diagnosis is not None
     catalogue = EFFECTS if run.source.run is None else run.source.run.catalogue
-    rows = ()
-    for row in run.diagnosis["candidates"]:
-        effect, chance = row["effect"], probability(row["p_value"]).removeprefix("= ")
-        rows += ((effect, effect_in_words(effect, catalogue), rounded(row["score"], ".6g"), chance),)
+    rows = tuple(
+        (row["effect"], effect_in_words(row["effect"], catalogue), rounded(row["score"], ".6g"), _chance(row))
+        for row in diagnosis["candidates"]
+    )
     table = Display("", head=("effect", "meaning", ">score", ">p"), rows=rows[:SHOWN_CANDIDATES])
     hidden_rows = rows[SHOWN_CANDIDATES:]
     limits = ()
-    for row in run.diagnosis.get("limits", ()):
+    for row in diagnosis.get("limits", ()):
         texts = value_and_error(row["value"], row["sigma"])
         limits += ((row["effect"], row["parameter"], *texts, rounded(row["below_95"], ".2g"), row["unit"]),)
     title = "amplitudes that were not found, with the size they stay below with 95 % probability"
@@ -307,9 +311,8 @@ def _doubts(summary: Mapping[str, Any]) -> list[str]:
 
 def _warnings(run: RunContents) -> tuple[str, ...]:
     """All doubts about the fit."""
-    summary, sentences = run.summary, ()
-    if summary["misfit"]:
-        sentences = summary["misfit"].get("sentences", ())
+    summary = run.summary
+    sentences = (summary["misfit"] or {}).get("sentences", ())
     flags = (f"Flag: {text}." for text in Quality(int(summary.get("quality", 0))).meanings)
     return (*summary["warnings"], *sentences, *flags, *summary["remarks"])
 
