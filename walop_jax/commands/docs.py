@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from walop_jax.commands.command import Job, Outcome, UsageError, command
 from walop_jax.io.errors import nearest
 
@@ -56,12 +58,8 @@ def _single(job: Job, topic: str, name: str | None) -> str:
 
 def pages() -> dict[str, str]:
     """The Markdown text of every page by topic, in alphabetical order."""
-    from importlib.resources import files
-
-    folder = files("walop_jax") / "docs"
-    entries = (entry for entry in folder.iterdir() if entry.name.endswith(".md") and entry.name != "index.md")
-    texts = {entry.name.removesuffix(".md"): entry.read_text(encoding="utf-8") for entry in entries}
-    return dict(sorted(texts.items()))
+    files = (Path(__file__).parents[1] / "docs").glob("*.md")
+    return dict(sorted((file.stem, file.read_text("utf-8")) for file in files if file.stem != "index"))
 
 
 def about(text: str) -> str:

@@ -242,26 +242,20 @@ def read_run(run: Run | Path) -> RunContents:
         if stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio:
             what = f"is of another fit than {names.SUMMARY}: this folder was written to again since"
             missing.append(f"{names.DIAGNOSIS} {what}.")
-    sampled = names.POSTERIOR in run
-    extras = {
-        "sample": optional(
-            names.SAMPLE, lambda: run.document(names.SAMPLE), "no verdict on the sampling", sampled
-        ),
-        "corner": optional(names.CORNER, (run.folder / names.CORNER).read_bytes, "no corner plot", sampled),
-        "limits": optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False),
-        "commissioning": optional(
-            names.COMMISSIONING,
-            lambda: run.document(names.COMMISSIONING, ("go", "requirements")),
-            "no go or no-go",
-            False,
-        ),
-    }
+    sampled, picture = names.POSTERIOR in run, run.folder / names.CORNER
+    sample = optional(names.SAMPLE, lambda: run.document(names.SAMPLE), "no verdict on the sampling", sampled)
+    corner = optional(names.CORNER, picture.read_bytes, "no corner plot", sampled)
+    limits = optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False)
+    read_certificate = functools.partial(run.document, names.COMMISSIONING, ("go", "requirements"))
+    certificate = optional(names.COMMISSIONING, read_certificate, "no go or no-go", False)
     if product is not None and diagnosis is None:
         try:
             run.calset  # noqa: B018
         except (ValueError, OSError) as error:
             missing.append(f"Residuals are not drawn: {error}.")
-    return RunContents(source, summary, product, diagnosis, pictures, missing=tuple(missing), **extras)
+    return RunContents(
+        source, summary, product, diagnosis, pictures, sample, corner, limits, certificate, tuple(missing)
+    )
 
 
 def read_limits(path: Path) -> DetectionLimits:
@@ -276,9 +270,8 @@ def read_limits(path: Path) -> DetectionLimits:
 
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:
     """The limits of the data behind a summary; those of other data are refused."""
-    documents = run.document(names.LIMITS, ("inputs",)), summary
+    path, documents = run.folder / names.LIMITS, (run.document(names.LIMITS, ("inputs",)), summary)
     of, expected = ({entry["sha256"] for entry in document["inputs"]} for document in documents)
-    path = run.folder / names.LIMITS
     if of != expected:
         raise fail("is of other data", file=path, advice="run walop-jax limits on the sets of this run")
     return read_limits(path)
