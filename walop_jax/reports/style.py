@@ -35,7 +35,6 @@ SMALL = 7
 NARROW = 4.5  # inches: a column of print, or half a page
 PRINTED = 7  # Type (pt) of a figure of a given width: what journals ask for at least, at the size of print
 WIDTHS = {"column": 89.0, "page": 183.0}  # widths (mm) of figures in journals, by name
-SHARED = ("sharex", "sharey")
 NARROWEST = 1.3  # inches of a panel of a given width: narrower ones go below each other
 NUMBER = 0.4  # inches of a number below an axis, with the gap to the next
 LABELS = 0.55  # inches of a panel that its title and numbers take, at any size
@@ -137,8 +136,6 @@ class Canvas:
         group = columns
         if turned:
             rows, columns, group = columns, rows, rows
-            swap = {"row": "col", "col": "row"}
-            options |= {key: swap.get(str(value), value) for key, value in options.items() if key in SHARED}
         elif self._narrow(columns, least) and "width_ratios" not in options:
             fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
             divisors = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
