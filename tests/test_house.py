@@ -209,8 +209,8 @@ MOST_LINES = {
     "nights": 2682,
     "plans": 2222,
     "paper": 775,
-    "reports": 2697,
-    "commands": 4133,
+    "reports": 2679,
+    "commands": 4077,
 }
 """Lines of each room: raising one is a decision of its own."""
 

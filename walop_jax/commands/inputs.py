@@ -19,8 +19,6 @@ from walop_jax.io.text import read_text
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
 
-
-GIGABYTE = 1e9
 Sets: TypeAlias = "CalibrationSet | PathLike | Sequence[PathLike]"
 ModelLike: TypeAlias = "Model | PathLike | None"
 InstrumentLike: TypeAlias = "Instrument | PathLike | None"

@@ -75,8 +75,7 @@ def refit(
         job.begin("reading")
         calset, chosen = inputs.set_and_model(data, model, instrument, effects, output=output)
         with repeated(job.progress) as say:
-            bytes_of = None if memory is None else memory * inputs.GIGABYTE
-            fitted = fit(calset, chosen, progress=say, memory=bytes_of)
+            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
             say(Stage("looking for patterns in the residuals", "examining"))
             result = answered(examined(fitted, job.seed), goal=inputs.goal_of(goal) or GOAL)
         if compress is not None:
