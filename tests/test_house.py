@@ -209,8 +209,8 @@ MOST_LINES = {
     "nights": 2558,
     "plans": 2191,
     "paper": 775,
-    "reports": 2679,
-    "commands": 4077,
+    "reports": 2690,
+    "commands": 4081,
 }
 """Lines of each room: raising one is a decision of its own."""
 

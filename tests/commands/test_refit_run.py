@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from frames_file import write_frames
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.calibration.residual_map import residual_map
-from walop_jax.commands.refit import refit
+from walop_jax.commands.refit import next_steps, refit
 from walop_jax.fit import search
 from walop_jax.likelihood import limits, runner
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -97,3 +98,13 @@ def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, c
         "calibration.fits",
         "summary.json",
     ]
+
+
+def test_lines_to_type_can_be_typed_whatever_a_folder_is_called(tmp_path):
+    """A shell takes paths with blanks as one word each."""
+    sets, run = [str(tmp_path / "first night.fits"), str(tmp_path / "b.fits")], tmp_path / "my run"
+    report, diagnose = map(shlex.split, next_steps(False, run, sets, model=Path("a model.toml")))
+    assert report == ["walop-jax", "report", str(run)]
+    asked = [*sets, "--model", "a model.toml", "-o", f"{run}_diagnosis"]
+    assert diagnose == ["walop-jax", "diagnose", *asked]
+    assert shlex.split(next_steps(True, run, sets)[1])[:3] == ["walop-jax", "apply", str(run)]

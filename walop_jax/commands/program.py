@@ -8,6 +8,7 @@ import importlib
 import inspect
 import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -231,7 +232,7 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
 def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
     """The lines of `NEXT` for the given arguments; those that need an output which was not written are left out."""
     texts = ((name, value if isinstance(value, list) else [value]) for name, value in given.items())
-    words = {name: " ".join(map(str, values)) for name, values in texts if values != [None]}
+    words = {name: shlex.join(map(str, values)) for name, values in texts if values != [None]}
     lines = NEXT.get(command.name, ())
     return tuple(line.format_map(words) for line in lines if set(re.findall(r"{(\w+)}", line)) <= set(words))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,8 +136,10 @@ def _compressed(result: FitResult) -> CalibrationSet:
 
 def next_steps(trusted: bool, output: Any, data: inputs.Sets, **options: object) -> tuple[str, ...]:
     """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
+    run, other = (shlex.quote(f"{output}{end}") for end in ("", "_diagnosis"))
     if trusted:
-        return (f"walop-jax report {output}", f"walop-jax apply {output} STARS.fits -o OUT.fits")
-    sets = " ".join(str(path) for path in inputs.paths_of(data)) if output is not None else "CALSET"
-    typed = "".join(f" --{name} {value}" for name, value in options.items() if isinstance(value, str | Path))
-    return (f"walop-jax report {output}", f"walop-jax diagnose {sets}{typed} -o {output}_diagnosis")
+        return (f"walop-jax report {run}", f"walop-jax apply {run} STARS.fits -o OUT.fits")
+    sets = shlex.join(map(str, inputs.paths_of(data))) if output is not None else "CALSET"
+    given = {name: str(value) for name, value in options.items() if isinstance(value, str | Path)}
+    typed = "".join(f" --{name} {shlex.quote(value)}" for name, value in given.items())
+    return (f"walop-jax report {run}", f"walop-jax diagnose {sets}{typed} -o {other}")

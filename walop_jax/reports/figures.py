@@ -1,6 +1,6 @@
 """Figures of a calibration and of a fit: plain `matplotlib` figures, to show in a notebook or to `savefig`.
 
-No figure touches the global state of matplotlib, so they may be made in threads and without a screen.
+They may be made without a screen, and in threads: one at a time sets the style, and leaves the settings as they were.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import io
 import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -365,11 +366,12 @@ def _inputs(summary: Mapping[str, Any]) -> Section:
 
 def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
     """Next steps: words and a command line."""
-    name = run.source.folder.resolve().name
-    sets = " ".join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
+    folder = run.source.folder.resolve().name
+    name, other = shlex.quote(folder), shlex.quote(f"{folder}_diagnosis")
+    sets = shlex.join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
     steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []
     if run.diagnosis is None:
-        steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {name}_diagnosis"))
+        steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {other}"))
     if run.limits is None and trusted:
         steps.append(("list mistakes that these data would not show", f"walop-jax limits {sets} -o {name}"))
     return [*steps, ("plan better exposures", f"walop-jax plan {name} --minutes 10")]

@@ -140,6 +140,8 @@ def transmission_figure(
         raise DataError(f"{what}: nothing to draw a curve through")
     block = calset.intensities.block(0, len(calset.points))
     complete = np.flatnonzero(block.used[:, rows].all(axis=1))
+    if not complete.size:
+        raise DataError(f"INTENSITIES: no field point has all polariser angles in {filter_name}")
     point = complete[np.argmin(np.hypot(block.x[complete] - place[0], block.y[complete] - place[1]))]
     angle, counts, sigma = e.clp_angle[rows], block.counts[point, rows], block.sigma[point, rows]
     total = counts.sum(axis=1, keepdims=True)

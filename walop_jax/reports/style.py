@@ -6,8 +6,9 @@ import contextlib
 import dataclasses
 import functools
 import math
+import threading
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -65,9 +66,14 @@ def texts(name: str) -> Mapping[str, Any]:
     return tomllib.loads((TEMPLATES / f"{name}.toml").read_text(encoding="utf-8"))
 
 
-def own_style() -> contextlib.AbstractContextManager[None]:
+_ONE_AT_A_TIME = threading.RLock()  # all threads share the settings of matplotlib
+
+
+@contextlib.contextmanager
+def own_style() -> Iterator[None]:
     """Settings of matplotlib as this package draws with, whatever a matplotlibrc or a notebook has set."""
-    return matplotlib.style.context(["default", SETTINGS])
+    with _ONE_AT_A_TIME, matplotlib.style.context(["default", SETTINGS]):
+        yield
 
 
 class PaperFigure(Figure):
@@ -190,7 +196,7 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
     def draw(*args: P.args, **options: P.kwargs) -> T:
         canvases = [arg for arg in (*args, *options.values()) if isinstance(arg, Canvas)]
         if any(canvas.ax is not None for canvas in canvases):
-            with matplotlib.rc_context(SIZES):
+            with _ONE_AT_A_TIME, matplotlib.rc_context(SIZES):
                 return function(*args, **options)
         with own_style():
             figure: Any = function(*args, **options)

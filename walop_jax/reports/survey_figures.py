@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -115,7 +116,7 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
     night = np.asarray(table["NIGHT"], float)
     time = day_of(night)
     for axis, (limited, (names, factor, label)) in zip(axes[:, 0], panels.items(), strict=True):
-        for name, marker in zip(names, "osD^v<>phx", strict=False):
+        for name, marker in zip(names, itertools.cycle("osD^v<>phx"), strict=False):
             values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
             error = factor * np.asarray(table[ERRORS[name]], float) if name in ERRORS else None
             outside = np.array([name in str(entry).split() for entry in table[OUTSIDE]])
