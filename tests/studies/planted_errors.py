@@ -146,7 +146,8 @@ ERRORS = (
     planted("posterior/result.py", "steps <= LENGTHS * history[2]", "steps <= history[2]", _CHAINS),
     planted("posterior/result.py", "if not np.max(rhat) < LARGEST_RHAT", "if np.max(rhat) < 0", _CHAINS),
     # nights
-    planted("nights/algebra.py", "border - gain @ last.left", "border + gain @ last.left", "nights/test_algebra.py"),
+    planted("nights/algebra.py", "border - gain @ done[-1].left", "border + gain @ done[-1].left",
+            "nights/test_algebra.py"),
     # science
     planted("science/estimate.py", "np.where(used, sigma, 1.0) ** 2", "np.where(used, sigma, 1.0)",
             "science/test_estimate.py"),
