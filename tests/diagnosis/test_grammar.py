@@ -179,6 +179,9 @@ def test_every_description_can_be_made(name):
     """Factors that are tried of a kind are among those that it may have at that place (`Change.check_factors`)."""
     instrument = nominal_instrument(name)
     exposures = dataclasses.replace(TURNING, instrument=name).exposures()
+    # EXPTIME by KIND alone is no more than the KIND.
+    assert not any("EXPTIME" in probe.name for probe in grammar.sentences(instrument, exposures, 20))
+    exposures = dataclasses.replace(exposures, exptime=30.0 + 30.0 * (np.arange(len(exposures)) % 2))
     every = grammar.sentences(instrument, exposures, 20)
     for probe in every:
         for text in sentences_of(probe):

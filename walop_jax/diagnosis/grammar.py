@@ -329,10 +329,10 @@ class Dependences:
         return bool(np.isfinite(angle).all() and np.ptp(remainder) > 1e-3 * np.ptp(angle))
 
     def _shows_exptime(self) -> bool:
-        seconds = self.exposures.exptime
-        return bool(
-            np.isfinite(seconds).all() and seconds.min() > 0 and np.ptp(seconds) > 1e-3 * seconds.max()
-        )
+        """True where exposures of one KIND have several exposure times: else these are degenerate with the KIND."""
+        seconds, kind = self.exposures.exptime[self.inside], self.exposures.kind[self.inside]
+        known = np.isfinite(self.exposures.exptime).all() and self.exposures.exptime.min() > 0
+        return bool(known and any(np.ptp(seconds[kind == name]) > 1e-3 * seconds.max() for name in kind))
 
     def _shows_order(self) -> bool:
         """True where the order of the exposures is not degenerate with time."""
