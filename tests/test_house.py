@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2655,
     "posterior": 2180,
     "science": 5809,
-    "diagnosis": 7897,
+    "diagnosis": 7898,
     "nights": 2558,
     "plans": 2191,
     "paper": 775,

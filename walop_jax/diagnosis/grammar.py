@@ -383,9 +383,10 @@ class Dependences:
         return [(hours[start], hours[stop - 1]) for start, stop in nights]
 
     def _kind(self) -> Iterator[tuple[str, ...]]:
-        """Kinds of exposures, but the most frequent."""
+        """Kinds of exposures; of all exposures without the most frequent, beside which parameters hold the same."""
         names, counts = np.unique(self.exposures.kind[self.inside], return_counts=True)
-        yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][1:])
+        first = int(self.inside.all() or len(names) == 1)
+        yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][first:])
 
     def _exposure(self) -> Iterator[tuple[str, ...]]:
         """Every single exposure, where there are enough field points."""
