@@ -57,7 +57,10 @@ def test_every_effect_has_a_limit_or_is_named_as_beyond_these_data(found):
 
 
 def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
-    """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 90 % of it clearly fewer."""
+    """Scores drawn with each effect at its limit: 99 % of the draws raise the alarm, at 80 % of it clearly fewer.
+
+    The effect alone would at 90 % of it in 95 % of the draws, at 80 % in 84 %; others that follow it add to that.
+    """
     space = examination.space
     trials = effective_trials(space.smallest_p(np.random.default_rng(2)))
     threshold = np.log(local_p(thresholds.ALARM, trials))
@@ -71,7 +74,7 @@ def test_the_alarm_is_raised_with_the_stated_probability(found, examination):
         if limit.detected[1] > 1.001 * limit.detected[0]:
             continue
         whole = limit.detected[0] * space.gram[:, places[probe.name].start]
-        at_limit, below = (alarms(space, noise - share * whole, threshold) for share in (1.0, 0.9))
+        at_limit, below = (alarms(space, noise - share * whole, threshold) for share in (1.0, 0.8))
         # Other candidates raise the alarm as well, so that it is rather more probable than the effect alone makes it.
         assert at_limit > thresholds.PROBABILITY - 4 * np.sqrt(0.01 * 0.99 / draws), probe.name
         assert below < 0.985, probe.name
