@@ -224,14 +224,13 @@ def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
     context = effect_context(result.model.template, result.calset.exposures)
-    labels = [f"{name}.{label}" for field in effect.kind.amplitudes() for label in effect.labels(field)]
-    expected = dict(zip(labels, effect.prior_widths(context).tolist(), strict=True))
-    far = {}
+    expected, far = effect.prior_widths(context), {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]
-        widths = abs(float(result.values[i]) - p.prior[0]) / expected[p.name]  # type: ignore[index]
+        label = p.name.removeprefix(f"{name}.")
+        widths = abs(float(result.values[i]) - p.prior[0]) / expected[label]  # type: ignore[index]
         if widths > PRIOR_EDGE:
-            far[p.name.removeprefix(f"{name}.")] = widths
+            far[label] = widths
     return far
 
 

@@ -332,7 +332,9 @@ class Dependences:
         """True where exposures of one KIND have several exposure times: else these are degenerate with the KIND."""
         seconds, kind = self.exposures.exptime[self.inside], self.exposures.kind[self.inside]
         known = np.isfinite(self.exposures.exptime).all() and self.exposures.exptime.min() > 0
-        return bool(known and any(np.ptp(seconds[kind == name]) > 1e-3 * seconds.max() for name in kind))
+        return bool(
+            known and any(np.ptp(seconds[kind == name]) > 1e-3 * seconds.max() for name in np.unique(kind))
+        )
 
     def _shows_order(self) -> bool:
         """True where the order of the exposures is not degenerate with time."""

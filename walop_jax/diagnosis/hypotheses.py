@@ -50,7 +50,7 @@ class Probe:
     @functools.cached_property
     def widths(self) -> Vector:
         """Prior widths of the amplitudes, member by member."""
-        return np.concatenate([member.prior_widths(self.context) for member in self.group])
+        return np.array([w for member in self.group for w in member.prior_widths(self.context).values()])
 
     @property
     def one_sided(self) -> Bool[np.ndarray, " _"]:

@@ -120,9 +120,8 @@ def diagnose(
     steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
-    alike: dict[
-        str, Collection[str]
-    ] = {}  # of a single group what the final model cannot separate from it as well
+    alike = dict[str, Collection[str]]()
+    # Of a single group also what the final model cannot separate from it; of several that is of all together.
     for trial, step in zip(state.steps, steps, strict=True):
         names = tuple(trial.groups) or (step.effect,)
         alone = {*step.equivalent, *step.nameless} - {Described.name}

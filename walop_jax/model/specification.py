@@ -287,9 +287,7 @@ def with_effects(
         names = [f"{effect.name}.{leaf.name}" for leaf in leaves(effect)]
         values = zip(np.asarray(values_of(effect)), np.asarray(values_of(neutral)), strict=True)
         starts |= dict(zip(names, values, strict=True))
-        fields = effect.kind.amplitudes()
-        labels = [f"{effect.name}.{label}" for field in fields for label in effect.labels(field)]
-        widths |= dict(zip(labels, effect.prior_widths(context).tolist(), strict=True))
+        widths |= {f"{effect.name}.{label}": w for label, w in effect.prior_widths(context).items()}
     sentences = {text for effect in active if isinstance(effect, Described) for text in effect.sentences}
     for effect in active:
         for text in sentences.intersection(effect.stated):

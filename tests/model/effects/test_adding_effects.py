@@ -81,7 +81,9 @@ def test_prior_widths_are_those_of_the_largest_values_of_factors():
     ):
         text = f"gain of O1{factors}"
         width = 0.003 / size
-        assert Described.saying([text], [0.0]).prior_widths(context) == pytest.approx([width])
+        assert Described.saying([text], [0.0]).prior_widths(context) == pytest.approx(
+            {text.replace(" ", "_"): width}
+        )
         model = with_effects(MODEL, [Described.saying([text], [0.0])], context)
         (prior,) = (p.prior for p in model.parameters if p.name == f"described.{text.replace(' ', '_')}")
         assert prior == pytest.approx((0.0, width))

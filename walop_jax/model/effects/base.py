@@ -159,13 +159,10 @@ class Effect(Component):
             values["camera"] = numbered_camera(self.name, values["camera"], context.cameras)
         return self.replaced(**values)
 
-    def prior_widths(self, context: Context) -> Float[np.ndarray, " a"]:
-        """Prior widths of the amplitudes for some data, in the order of its parameters."""
-        declared = self.declarations()
-        widths = (
-            np.full(np.size(getattr(self, n)), declared[n].width or 1.0) for n in self.kind.amplitudes()
-        )
-        return np.concatenate([np.zeros(0), *widths])
+    def prior_widths(self, context: Context) -> dict[str, float]:
+        """Prior widths of the amplitudes for some data by label, in the order of its parameters."""
+        declared, names = self.declarations(), self.kind.amplitudes()
+        return {label: declared[name].width or 1.0 for name in names for label in self.labels(name)}
 
     def moved(self, amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
         """The effect with numbers added to its amplitudes, in the order of its parameters."""

@@ -99,11 +99,11 @@ class Described(Effect):
         """The descriptions themselves, without blanks."""
         return [change.label for change in map(Change.parsed, self.sentences) if change.parameter == field]
 
-    def prior_widths(self, context: Context) -> Float[np.ndarray, " a"]:
+    def prior_widths(self, context: Context) -> dict[str, float]:
         """Every change is as large as its kind may be where its factors are largest."""
         changes = [Change.parsed(text) for text in self.sentences]
         ordered = (change for name in AMPLITUDES for change in changes if change.parameter == name)
-        return np.array([change.width(context.largest) for change in ordered])
+        return {change.label: change.width(context.largest) for change in ordered}
 
     def terms(self) -> Iterator[tuple[Change, Scalar]]:
         """Every change with its amplitude."""
