@@ -11,7 +11,7 @@ from small_run import SMALL
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
-from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.examination import Examination, examine
 from walop_jax.diagnosis.findings import Diagnosis, Step
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
@@ -26,8 +26,8 @@ TOLD = "gain of O1 * kind moon"
 
 
 @functools.cache
-def told() -> tuple[FitResult, Context, Any]:
-    """A camera is brighter on the Moon by 0.3 %: the fit, the context, and the class of that description."""
+def examined() -> Examination:
+    """A camera is brighter on the Moon by 0.3 %: the fit of that description, its gains asked."""
     calset = simulate(SMALL, seed=3, effects=[Described.saying([TOLD], [3e-3])]).calset
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([TOLD], [0.0])], context)
@@ -37,8 +37,15 @@ def told() -> tuple[FitResult, Context, Any]:
         for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
         if probe.name.startswith("gain of")
     ]
-    state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    return result, context, ambiguities(state, context, {TOLD: ()})
+    return examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
+
+
+@functools.cache
+def told() -> tuple[FitResult, Context, Any]:
+    """That fit, the context, and the class of the description."""
+    result = examined().result
+    context = effect_context(result.model.template, result.calset.exposures)
+    return result, context, ambiguities(examined(), context, {TOLD: ()})
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
 from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
@@ -23,6 +24,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.blemish import Blemish
+from walop_jax.model.effects.change import Change
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import simulate
@@ -92,6 +94,32 @@ def test_a_class_of_one_changes_nothing(told):
     result, context, _ = told
     alone = Calibration.from_fit(result.judged())
     assert averaged(alone, Classes(), context) is alone
+
+
+def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
+    """Of three equally probable ones and e^−6.8 of that: all parameters would be smaller by what is left out."""
+    result, context, _ = told
+    laid = Laid(class_scene.examined())
+    real, rival = LinearStep.candidates, (((1.0, Change.parsed("gain of O1 * hours")),),)
+
+    def candidates(step, of_addition, alike):
+        (first, *_) = real(step, of_addition, alike)
+        for k, less in enumerate((0.0, 0.0, 6.8)):
+            change = first.change + 10.0 * (k + 1) * laid.errors
+            yield first._replace(name="", sums=rival, evidence=of_addition - less, change=change)
+
+    monkeypatch.setattr(LinearStep, "candidates", candidates)
+    monkeypatch.setattr(LinearStep, "in_other_kinds", lambda step, member: None)
+    (group,) = classes_of(laid, context, {TOLD: ()})
+    assert len(group.members) == 4
+    assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
+    # What no member changes, the mean does not change: half-wave plates of thousands of µm, for example.
+    alone = Calibration.from_fit(result.judged())
+    product = averaged(alone, Classes(additions=(group,)), context)
+    values = dict(zip(product.model.names, product.values, strict=True))
+    for name, value, of in zip(alone.model.names, alone.values, alone.model.parameters, strict=True):
+        if not of.free and of.tie is None:
+            assert values[name] == pytest.approx(value, rel=1e-12), name
 
 
 def test_what_was_added_is_in_its_class_once():

@@ -176,7 +176,6 @@ class Laid:
         members = [
             member._replace(probability=float(weight))
             for member, weight in zip(members, weights, strict=True)
-            if weight > np.exp(-thresholds.IMPROBABLE) or member is addition
         ]
         return ClassOf(name, at, tuple(members), *self._spread(members))
 
