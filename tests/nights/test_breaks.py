@@ -149,3 +149,19 @@ def test_a_model_holds_one_shape_of_an_effect():
     assert breaks._other_shapes(data, (Law(), Law(), None, None, None, None)) == [
         names.index("ghost#1.depth")
     ]
+
+
+def test_the_size_of_a_step_between_two_intervals_is_the_difference_of_their_values():
+    """A value of 5 before and of 6.2 after: by a step of the law, and by one more edge of its intervals."""
+    change, sizes = np.zeros((NIGHTS, N)), []
+    change[:, 1], change[40:, 1] = 5.0, 6.2
+    data = series(7, change)
+    middle = 0.5 * (data.nights[10].end + data.nights[11].begin)
+    for law in (Law(), Law(("interval",), at=(middle,))):
+        (step,), _, solution = breaks.find(data, (LAWS[0], law, *LAWS[2:]), ())
+        one = breaks.at_solution(data, solution, step)
+        assert (one.kind, one.name) == ("step", "p1.x")
+        assert abs(one.size - 1.2) < 4.0 * one.error
+        sizes.append((one.size, one.error))
+    # With an edge that nothing happens at, less data show what was before: the error is larger.
+    assert sizes[1][1] > sizes[0][1]

@@ -200,11 +200,15 @@ def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     """A break with the size that a solution under its law gives it."""
     system, i = solution.system, data.names.index(one.name)
     form, scale = one.form(float(data.equations.mjd.mean())), float(data.equations.scale[i])
-    for g, entry in enumerate(system.globals):
-        if entry.parameter == i and (entry.form.kind, entry.form.start) == (form.kind, form.start):
-            error = scale * math.sqrt(solution.covariance[g, g])
-            return dataclasses.replace(one, size=scale * float(solution.shared[g]), error=error)
-    return one
+    forms = [entry.form if entry.parameter == i else None for entry in system.globals]
+    change = np.array([float(f is not None and (f.kind, f.start) == (form.kind, form.start)) for f in forms])
+    if not change.any():
+        return one
+    law = system.laws[i]
+    if one.kind == "step" and law is not None and law.base == "interval":  # values before and after, no change
+        change -= [f is not None and f.stop == form.start for f in forms]
+    error = scale * math.sqrt(change @ solution.covariance @ change)
+    return dataclasses.replace(one, size=scale * float(change @ solution.shared), error=error)
 
 
 def with_breaks(data: Together, laws: Laws, found: Sequence[Break]) -> tuple[Law | None, ...]:
