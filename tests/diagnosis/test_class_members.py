@@ -63,6 +63,19 @@ def test_the_product_lies_between_and_its_errors_hold_both(told):
     assert "plan --criterion apart" in sentence
 
 
+def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):
+    """Two ways to the same numbers: the model with all members, and the change of the matrix by each."""
+    result, context, classes = told
+    alone = Calibration.from_fit(result.judged())
+    product = averaged(alone, classes, context)
+    at = result.calset.points.x, result.calset.points.y
+    change = (product.matrix(*at)[0] - alone.matrix(*at)[0]).reshape(len(at[0]), -1)
+    (group,) = classes.additions
+    mean = sum(member.probability * member.change for member in group.members)
+    assert np.abs(mean).max() > 5e-4
+    np.testing.assert_allclose(change, mean, atol=0.01 * np.abs(mean).max())
+
+
 def test_one_amplitude_of_two_kinds_is_one_parameter(told):
     """The polariser and the standards are wrong by the same: a covariance of both as two would be singular."""
     result, context, classes = told
