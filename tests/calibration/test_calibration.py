@@ -322,6 +322,23 @@ def test_error_between_grid_points(whole_south_set, south_fit, name, limit):
     assert np.all(found.error <= limit)
 
 
+def test_errors_from_draws_hold_the_structure_of_field_points_too():
+    """Draws of the covariance give the errors of the covariance: of 4000, to some per cent."""
+    linear = Calibration.from_fit(small_fit_with_plate())
+    linear = dataclasses.replace(
+        linear, verdict=dataclasses.replace(linear.verdict, structure=Structure(2e-3, 2e-3))
+    )
+    draws = np.random.default_rng(0).multivariate_normal(
+        linear.values, linear.covariance, 4000, method="eigh", check_valid="ignore"
+    )
+    at = np.array([0.1, -0.2]), np.array([0.05, 0.1])
+    errors = [
+        np.sqrt(np.diagonal(c.matrix(*at)[1], axis1=1, axis2=2))
+        for c in (linear, dataclasses.replace(linear, draws=draws))
+    ]
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0.06)
+
+
 @pytest.mark.parametrize(("gain", "response"), [(1e-3, 0.0), (0.0, 2e-3), (1e-3, 2e-3)])
 def test_structure_is_the_scatter_of_gains_and_responses(gain, response):
     """Gains of 1 ± g of both cameras of an arm, and responses that change by r of their counts: drawn, not derived."""

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from astropy import units
 from astropy.table import MaskedColumn, Table
+from small_run import SMALL
 
 from walop_jax.data.user_tables import extended, read_input_table
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import write_table
+from walop_jax.model.effects import effect_by_name
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.science.field_points import field_points
 
@@ -110,3 +114,20 @@ def test_columns_are_added(tmp_path, name):
         write_table(tmp_path / name, extended(source, {}))
     write_table(tmp_path / name, extended(source, {}), overwrite=True)
     assert "M22" in read_input_table(tmp_path / name).names
+
+
+def test_hour_angles_of_a_whole_day_are_counted_from_the_meridian(tmp_path):
+    """23.5 h is half an hour before the meridian: optics that follow the hour angle are those of −0.5 h."""
+    Table({"X": [0.0] * 5, "Y": [0.1] * 5, "HA": [0.5, 23.5, -0.5, 12.0, 13.0]}).write(tmp_path / "t.fits")
+    points = field_points(read_input_table(tmp_path / "t.fits"), SOUTH)
+    assert points.settings.hour_angle.tolist() == [0.5, -0.5, -0.5, 12.0, -11.0]
+
+
+@pytest.mark.parametrize(("effect", "column"), [("flexure", "HA"), ("hwp_temperature", "TEMP")])
+def test_a_missing_column_that_the_optics_depend_on_is_named(tmp_path, effect, column):
+    Table({"X": [0.0], "Y": [0.1]}).write(tmp_path / "t.fits")
+    device = dataclasses.replace(SOUTH, effects=(effect_by_name(effect).neutral(SMALL.context()),))
+    for instrument, asked in ((SOUTH, False), (device, True)):
+        source = read_input_table(tmp_path / "t.fits")
+        field_points(source, instrument)
+        assert any(f"{column} is missing" in remark for remark in source.remarks) == asked

@@ -223,6 +223,43 @@ def test_a_walk_is_a_gaussian_process():
         assert covariance[0, 0] == pytest.approx(variance[k], rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("law", "observed", "before", "later"),
+    [
+        (Law(("night", "step"), at=(59003.0,)), [0.0, 0.0, 0.0, 1.0, 1.0, 1.0], 0.0, 1.0),
+        (Law(("night", "bad"), bad=((59002.0, 59003.0),)), [0.0, 0.0, 3.0, 0.0, 0.0, 0.0], 0.0, 0.0),
+        (Law(("file", "step"), at=(59003.0,)), [2.0, 2.0, 2.0, 3.0, 3.0, 3.0], 2.0, 3.0),
+    ],
+)
+def test_values_of_single_nights_and_a_step_elsewhere(law, observed, before, later):
+    """In a night without data the values of single nights have their mean, beside the step that holds there."""
+    found = of_one(law, observed)
+    for time, wanted in ((58990.0, before), (59020.0, later)):
+        value, covariance = found.predict(time)
+        assert value[0] == pytest.approx(wanted, abs=0.02)
+        assert covariance[0, 0] < 0.1**2  # a step is no scatter of the nights
+
+
+def test_the_error_of_a_further_night_holds_that_of_the_mean():
+    """Of n values with standard deviation s about their mean, another one is off by s √(1 + 1/n)."""
+    value, covariance = of_one(Law(("night",)), [0.0, 1.0], width=np.inf).predict(59020.0)
+    assert value[0] == pytest.approx(0.5, abs=1e-6)
+    assert covariance[0, 0] == pytest.approx(0.5 * 1.5, rel=1e-6)
+
+
+def of_one(law, observed, width=10.0):
+    """Nights of one parameter, each observed to ±0.01."""
+    data, count = np.array(observed), len(observed)
+    precision, number = np.full(count, 1e4), np.arange(count)
+    equations = algebra.Equations(
+        59000.2 + number, number, number, precision * data**2, -(precision * data)[:, None],
+        precision[:, None, None], np.ones(1),
+    )  # fmt: skip
+    return algebra.solve(
+        algebra.System.of(equations, [law], np.zeros(1), np.full(1, width), np.ones(1, bool))
+    )
+
+
 def test_what_nothing_determines_is_named():
     equations, *_ = world()
     matrix, gradient = equations.matrix.copy(), equations.gradient.copy()

@@ -72,7 +72,36 @@ def test_a_night_lasts_from_noon_to_noon():
     mjd = 61000.0 + np.array([10.5, 10.7, 23.9, 24.1, 34.5, 34.7]) / 24.0
     assert night_numbers(mjd, SAAO).tolist() == [60999, 61000, 61000, 61000, 61000, 61001]
     nowhere = dataclasses.replace(SAAO, longitude=np.nan)
-    assert night_numbers(mjd, nowhere).tolist() == [61000, 61000, 61000 + 0, 61000, 61001, 61001]
+    # Without a site noon is in the middle of the longest part of the day without exposures, at 17:18 UTC.
+    assert night_numbers(mjd, nowhere).tolist() == [60999, 60999, 61000, 61000, 61000, 61000]
+
+
+def test_longitudes_east_of_180_are_those_west_of_it():
+    """Las Campanas at −70.7° or 289.3°: noon at 16:43 UTC."""
+    mjd = 60000.0 + np.array([0.03, 0.4, 0.68, 0.71, 1.03])
+    for longitude in (-70.7, 289.3):
+        assert night_of(mjd, longitude).tolist() == [59999, 59999, 59999, 60000, 60000]
+
+
+def test_files_of_one_night_without_a_longitude_are_of_one_night():
+    """One begins before midnight UTC and one after it; nights of a day later are others, also in one file."""
+    first, second = 59000.99 + np.array([0.0, 0.15, 0.31]), 59001.02 + np.array([0.0, 0.03])
+    assert set(night_of(first, np.nan)) == set(night_of(second, np.nan)) == {59000.0}
+    two = np.array([59001.05, 59001.15, 59001.95, 59002.1])
+    assert night_of(two, np.nan).tolist() == [59000, 59000, 59001, 59001]
+    # A laboratory day and night: the gap of nine hours in three days parts them.
+    long = np.concatenate([np.arange(0.0, 1.5, 0.1), np.arange(1.9, 3.0, 0.1)]) + 59000.0
+    assert night_of(long, np.nan).tolist() == [59000.0] * 15 + [59001.0] * 11
+
+
+def test_nights_that_overlap_are_refused(nights):
+    """A walk would go backwards in time."""
+    first = nights[0]
+    other = dataclasses.replace(
+        first, number=first.number + 1, begin=first.begin + 0.01, end=first.end + 0.01, sha256="other"
+    )
+    with pytest.raises(DataError, match=r"overlap: .* \(SITELONG"):
+        equations.check_together([first, other])
 
 
 def test_nights_without_a_longitude_are_asked_for_too(monkeypatch):
@@ -93,7 +122,7 @@ def test_nights_without_a_longitude_are_asked_for_too(monkeypatch):
 def test_exposures_whose_time_is_not_known_are_of_no_night():
     found = night_of(np.array([np.nan, 10.2, 11.2, 10.3]), np.nan)
     assert np.isnan(found[0])
-    assert found[1:].tolist() == [10.0, 11.0, 10.0]
+    assert found[1:].tolist() == [9.0, 10.0, 9.0]  # observed after midnight UTC
     assert night_of(np.array([10.2, np.nan]), 90.0)[0] == 9.0
 
 

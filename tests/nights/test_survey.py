@@ -16,11 +16,11 @@ import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.base_model import base_model, model_for
+from walop_jax.fit.base_model import base_model, model_for, model_like
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import Deviations, effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.nights import making, night_file, stacking
 from walop_jax.nights.equations import night_equations
@@ -60,6 +60,29 @@ def single(sets):
 @pytest.fixture(scope="module")
 def quiet(sets, single):
     return stack([single, *sets[1:3]])
+
+
+def test_errors_of_undetected_changes_remain_in_the_product_of_a_survey(sets, single):
+    """Nights do not show them: the variance of the matrix is that of the nights and that of the deviations."""
+    plain = Calibration.from_fit(single)
+    context = effect_context(plain.model.template, plain.exposures)
+    places = (f"behind {plain.model.template.path[-1]}",)
+    model = with_effects(plain.model, [Deviations.of(context, places=places)], context)
+    old, at = [model.index(name) for name in plain.model.names], model.positions(Deviations.name)
+    values, covariance = model.start, np.zeros((len(model.names),) * 2)
+    values[old] = plain.values
+    covariance[np.ix_(old, old)] = plain.covariance
+    covariance[at, at] = 1e-5**2
+    wide = dataclasses.replace(plain, model=model, values=values, covariance=covariance)
+    start = dict(zip(plain.model.names, plain.values.tolist(), strict=True))
+    nights = night_equations(sets[0], model_like(sets[0], model), start, {})
+    x, y = plain.raster(3)
+    variances = [
+        np.diagonal(c.matrix(x, y)[1], axis1=1, axis2=2)
+        for c in (plain, wide, *(stack(nights, like=c, find=False).at(SMALL.start) for c in (plain, wide)))
+    ]
+    assert np.median(variances[1] / variances[0]) > 1.05
+    np.testing.assert_allclose(variances[3] - variances[2], variances[1] - variances[0], rtol=1e-6)
 
 
 def test_a_stack_is_the_joint_fit(sets, quiet):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_run import small_fit
 
 import walop_jax as walop
 from walop_jax.calibration.accuracy import p_errors
@@ -20,10 +21,11 @@ from walop_jax.fit.refit import refit
 from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
 from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.likelihood import prior_rows
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.available import Available, Costs
 from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
-from walop_jax.plans.exposures import Illumination, candidates
+from walop_jax.plans.exposures import Illumination, candidates, information_of
 from walop_jax.plans.plan import plan_from
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
@@ -69,6 +71,19 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     seen = np.isfinite(promised)
     assert 0.5 < seen.mean() < 1.0
     np.testing.assert_allclose(promised[seen], found[seen], rtol=0.02)
+
+
+def test_what_a_calibration_knows_holds_its_priors_once():
+    """With the priors that every plan has its information gives the errors of the calibration itself."""
+    known = Calibration.from_fit(small_fit())
+    model = known.model
+    names = [model.names[i] for i in model.free if model.parameters[i].part != "sky"]
+    rows = prior_rows(model).jacobian(np.eye(len(model.names)))[:, [model.index(name) for name in names]]
+    before = information_of(known, names) + rows.T @ rows
+    sigma = np.array([float(np.sqrt(known.covariance[i, i])) for i in map(model.index, names)])
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(before))), sigma, rtol=1e-3)
+    # Moonlight is depolarised by another amount in another night.
+    assert not information_of(known, ["sky.depolarisation"]).any()
 
 
 def test_errors_have_the_floor_of_the_instrument():

@@ -263,11 +263,16 @@ class Calibration(Contents, Fitted):
 
     def widened(self, covariance: Float[np.ndarray, "f f"]) -> Matrix:
         """The covariance of all parameters, from another one of the parameters of the fit."""
-        at, fitted = self.model.positions(Deviations.name), self.fitted
-        across = self.covariance[:, at]
-        total = across @ pseudo_inverse(self.covariance[np.ix_(at, at)], 1e-12) @ across.T
+        total, fitted = self.of_deviations, self.fitted
         total[np.ix_(fitted, fitted)] += covariance
         return total
+
+    @property
+    def of_deviations(self) -> Matrix:
+        """The part of the covariance that deviations from descriptions, and undetected changes, make."""
+        at = self.model.positions(Deviations.name)
+        across = self.covariance[:, at]
+        return across @ pseudo_inverse(self.covariance[np.ix_(at, at)], 1e-12) @ across.T
 
     @property
     def instrument(self) -> str:
@@ -336,10 +341,11 @@ class Calibration(Contents, Fitted):
         filters = self.curves(settings)
         if self.draws is not None:
             drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
-            away = drawn - drawn.mean(axis=0)
-            return drawn.mean(axis=0), np.einsum("dpi,dpj->pij", away, away) / (len(drawn) - 1)
-        instrument = self.model.instrument(self.values)
-        values, covariance = matrices(instrument, settings, filters, x, y, self.covariance)
+            values = drawn.mean(axis=0)
+            covariance = np.einsum("dpi,dpj->pij", drawn - values, drawn - values) / (len(drawn) - 1)
+        else:
+            instrument = self.model.instrument(self.values)
+            values, covariance = matrices(instrument, settings, filters, x, y, self.covariance)
         return values, covariance + of_structure(self.verdict.structure, values)
 
     def over_field(

@@ -65,6 +65,12 @@ TEMPERATURE = 10.0
 """Temperature of the instrument (Celsius) where nothing is said of it."""
 
 
+def nearest_hours(hour_angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Hour angles (h) from −12 to 12: 23.5 h is half an hour before the meridian. A missing one is 0."""
+    hours = np.nan_to_num(hour_angle)
+    return np.where(np.abs(hours) > 12.0, (hours + 12.0) % 24.0 - 12.0, hours)
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Optical settings, one per row.
@@ -108,7 +114,7 @@ class Settings:
             filter=exposures.filter,
             teff=exposures.teff,
             temperature=np.where(np.isfinite(exposures.temp), exposures.temp, TEMPERATURE),
-            hour_angle=np.nan_to_num(exposures.ha),
+            hour_angle=nearest_hours(exposures.ha),
             positions={p: np.where(entry.inside, entry.angle, np.nan) for p, entry in positions.items()},
             turns={p: entry.turn for p, entry in positions.items() if entry.turn.any()},
         )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Exposures, FilterCurve, Sources
-from walop_jax.data.settings import Settings
+from walop_jax.data.settings import Settings, nearest_hours
 from walop_jax.io.errors import fail
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
@@ -54,7 +54,7 @@ def exposure_arrays(
         rotator=array(np.deg2rad(np.nan_to_num(exposures.rotator))),
         hours=array(hours_of(exposures)),
         temperature=array(exposures.temp),
-        hour_angle=array(np.nan_to_num(exposures.ha)),
+        hour_angle=array(nearest_hours(exposures.ha)),
         exptime=array(exposures.exptime),
         moving={  # NaN where they are out
             prefix: array(np.deg2rad(np.where(at.inside, at.angle, np.nan)))

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
+from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.laws import Form, Law
 
 Laws = Sequence[Law | None]
@@ -348,7 +349,7 @@ class Solution:
         """
         system, e, n = self.system, self.system.equations, len(self.system.laws)
         terms: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
-        extra, value = np.zeros(n), np.zeros(n)
+        extra, value, scattering = np.zeros(n), np.zeros(n), list[int]()
         here: tuple[int, int] | None = None  # the cell of the night, and the place of its unit in it
         for c, cell in enumerate(system.cells):
             if night is not None and night in e.night[cell.units]:
@@ -366,17 +367,36 @@ class Solution:
             elif np.isfinite(system.spread[i]):
                 extra[i] += system.spread[i] ** 2
             else:
-                scatter = self.values[:, i]
-                value[i], extra[i] = scatter.mean(), scatter.var(ddof=1) if len(scatter) > 1 else np.inf
+                value[i], extra[i] = self._elsewhere(i, mjd)
+                scattering.append(i)
         design = np.zeros((n, len(self.shared) + len(terms)))
         design[system.at, np.arange(len(self.shared))] = system.functions(mjd)[0]
         for k, (i, _, _, weight) in enumerate(terms):
             design[i, len(self.shared) + k] = weight
+        design[scattering] = 0.0
         local = np.array([self.local[c][k] for _, c, k, _ in terms])
         value += design @ np.concatenate([self.shared, local])
         covariance = design @ self._joint(terms) @ design.T
         covariance[np.diag_indices(n)] += extra
         return value, covariance
+
+    def _elsewhere(self, i: int, mjd: float) -> tuple[float, float]:
+        """A value of single nights or files at a time without data, and its variance.
+
+        Least squares of the values in a constant and the steps, bad nights and trends of the parameter: these may be
+        in the values as well as beside them. The variance is that of the residuals, and of what was fitted.
+        """
+        system = self.system
+        cells = ((cell.units, cell.covers[cell.parameter == i] > 0) for cell in system.cells)
+        first = np.array([units[covers][0] for units, rows in cells for covers in rows])
+        functions = np.vstack([system.basis[first], system.functions(mjd)])[:, system.at == i]
+        functions = np.column_stack([np.ones(len(functions)), functions])
+        design, here, values = functions[:-1], functions[-1], self.values[first, i]
+        inverse = pseudo_inverse(design.T @ design, 1e-12)
+        coefficients = inverse @ (design.T @ values)
+        free = len(first) - np.linalg.matrix_rank(design)
+        scatter = float(np.sum((values - design @ coefficients) ** 2)) / free if free > 0 else np.inf
+        return float(here @ coefficients), scatter * (1.0 + float(here @ inverse @ here))
 
     def _bridge(self, i: int, mjd: float, extra: Vector) -> list[tuple[int, int, int, float]]:
         """The states beside a time with their weights; the variance of the walk between them is added to `extra`."""

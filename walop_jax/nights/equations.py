@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -453,6 +454,9 @@ def together(nights: Sequence[Night]) -> Together:
     return Together(ordered, tuple(union.values()), n - len(of_model), origin, mean, width, equations)
 
 
+_NO_SITE = (
+    "give all files the longitude of the site (SITELONG), which says where a night ends, and correct MJD"
+)
 _ONE_STAR = "correct one of them, or give it another NAME"
 
 
@@ -473,6 +477,12 @@ def check_together(nights: Sequence[Night]) -> None:
                 star = p.name.split(".")[1]
                 what = f"the catalogue has other values of {star} in {night.source} than in {theirs.source}"
                 raise fail(what, extension="SOURCES", advice=_ONE_STAR)
+    by_number = sorted(nights, key=lambda night: (night.number, night.end))
+    for before, after in itertools.pairwise(by_number):
+        if after.begin < before.end and after.number != before.number:
+            what = f"the nights of MJD {before.number} and {after.number} overlap"
+            where = f"{before.source} until {before.end:.3f}, {after.source} from {after.begin:.3f}"
+            raise fail(f"{what}: {where}", advice=_NO_SITE)
     earlier: dict[Any, Night] = {}
     for night in nights:
         for key in (night.key, (night.begin, night.end)):

@@ -247,10 +247,14 @@ class Survey(Drawn):
         select[[model.index(names[k]) for k in present], np.arange(len(present))] = 1.0
         select = select[model.masters]
         inside = select.any(axis=1)
+        total = select @ covariance[np.ix_(present, present)] @ select.T
+        # Nights do not show the deviations in the errors of the reference.
+        of_reference = [model.index(name) for name in self.reference.model.names]
+        total[np.ix_(of_reference, of_reference)] += self.reference.of_deviations
         return dataclasses.replace(
             full,
             values=np.where(inside, select @ value[present], full.values),
-            covariance=select @ covariance[np.ix_(present, present)] @ select.T,
+            covariance=total,
             origin=f"{len(self.data.nights)} nights, stacked, at MJD {mjd:.5f}",
             inputs=(),
         )

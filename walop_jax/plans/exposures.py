@@ -35,6 +35,7 @@ from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
+from walop_jax.model.sources import MoonSky
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
@@ -444,7 +445,7 @@ def _root(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n m"]:
     size = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
     size = np.where(size > 0, size, 1.0)
     value, vector = np.linalg.eigh(matrix / np.outer(size, size))
-    significant = value > _ROUNDING * value[-1]
+    significant = value > _ROUNDING * value.max(initial=0.0)
     return size[:, None] * vector[:, significant] * np.sqrt(value[significant])
 
 
@@ -457,10 +458,16 @@ def _mixed(
 def information_of(
     known: Calibration, names: Sequence[str], effects: Collection[str] = ()
 ) -> Float[np.ndarray, "f f"]:
-    """Information of a calibration on parameters by name; none on those that it has not, nor on those of `effects`."""
-    model = known.model
-    shared = [i for i, n in enumerate(names) if n in model.names and model[n].part not in effects]
+    """Information of the data of a calibration on parameters by name, beside their priors.
+
+    None on those that it has not, nor on those of `effects` and of the moonlit sky, which is another one next time.
+    """
+    model, without = known.model, {*effects, MoonSky.name}
+    shared = [i for i, n in enumerate(names) if n in model.names and model[n].part not in without]
     columns = [model.index(names[i]) for i in shared]
+    jacobian = prior_rows(model).jacobian(np.eye(len(model.names)))[:, columns]
+    posterior = pseudo_inverse(known.covariance[np.ix_(columns, columns)], 1e-12)
+    root = _root(posterior - jacobian.T @ jacobian)
     information = np.zeros((len(names), len(names)))
-    information[np.ix_(shared, shared)] = pseudo_inverse(known.covariance[np.ix_(columns, columns)], 1e-12)
+    information[np.ix_(shared, shared)] = root @ root.T
     return information

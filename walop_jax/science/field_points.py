@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import EXPOSURES, TURN, Column, check, finite
-from walop_jax.data.settings import TEMPERATURE, Settings
+from walop_jax.data.settings import TEMPERATURE, Settings, nearest_hours
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable, empty_cells, numeric_column, read_input_table
 from walop_jax.io.errors import rows_text
+from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
@@ -34,6 +35,12 @@ POINT_COLUMNS: Mapping[str, Column] = {
     "TEMP": _also_finite(EXPOSURES["TEMP"], TEMPERATURE),
     "HA": _also_finite(EXPOSURES["HA"], 0.0),
 }
+
+
+_ASSUMED = (
+    ("TEMP", "temperature", f"{TEMPERATURE:g} Celsius"),
+    ("HA", "hour_angle", "the meridian"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +117,11 @@ def field_points(
             f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}"
         )
         raise place.fail(what, "X, Y", "field coordinates are in degrees: are these arcmin or pixels?")
+    for name, condition, assumed in _ASSUMED:
+        if name not in source.names and condition in needs(instrument).conditions:
+            what = f"is missing, and the optics of this calibration depend on it: {assumed} is assumed"
+            source.remarks.append(f"{name} {what}; add the column")
+    columns["HA"] = nearest_hours(columns["HA"])
     stated = (columns[name] for name in ("FILTER", "TEFF", "TEMP", "HA"))
     return FieldPoints(x, y, Settings(*stated, positions=positions, turns=turns), outside)
 

@@ -2,10 +2,11 @@
 
 A night lasts from noon to noon of the mean Sun at the site, and has the MJD of its evening:
 
-    night = ⌊MJD + λ/360° − ½⌋        λ the longitude, east positive
+    night = ⌊MJD + λ/360° − ½⌋        λ the longitude, east positive, −180° to 180°
 
-Where the longitude is not known, `GAP` hours without an exposure part two nights; such a night has the MJD of its first
-exposure.
+Where the longitude is not known, noon is the middle of the longest part of the day without an exposure. Exposures of
+the same night in another file may then make another noon: with the longitude they cannot. Where no part of the day is
+without exposures for `GAP` hours, gaps of that length part two nights, which have the MJD of their first exposures.
 """
 
 from __future__ import annotations
@@ -21,8 +22,17 @@ FIRST_DATE = 30000.0
 def night_of(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray, " e"]:
     """The night of every exposure (`mjd` UTC, days), NaN where the time is not known; NaN is an unknown longitude."""
     if np.isfinite(longitude):
-        return np.floor(mjd + longitude / 360.0 - 0.5)
+        return np.floor(mjd + ((longitude + 180.0) % 360.0 - 180.0) / 360.0 - 0.5)
     night, dated = np.full(len(mjd), np.nan), np.flatnonzero(np.isfinite(mjd))
+    if not len(dated):
+        return night
+    of_day = np.unique(mjd[dated] % 1.0)
+    gaps = np.diff(of_day, append=of_day[0] + 1.0)
+    longest = int(np.argmax(gaps))
+    if gaps[longest] > GAP / 24.0:
+        noon = (of_day[longest] + 0.5 * gaps[longest]) % 1.0
+        night[dated] = np.floor(mjd[dated] - noon)
+        return night
     order = dated[np.argsort(mjd[dated], kind="stable")]
     first = first_of_nights(mjd[order])
     night[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(order))))
