@@ -3,7 +3,7 @@
 Equations   A standard as the other data see it, its own catalogue value taken out of the fit: with the covariance C and
             the value v of (q, u) in the fit, and the prior (c, W) of the catalogue,
                 M⁻¹ = C⁻¹ − W⁻¹,   m = M (C⁻¹ v − W⁻¹ c)
-            Angle ½ (m × c)/|c|² and ratio m·c/|c|² of the polarised ones, m − c of the others: means with weights
+            Angle ½ (c × m)/|c|² and ratio m·c/|c|² of the polarised ones, m − c of the others: means with weights
             1/(their variance and that of the catalogue).
 Source      trending of polarised and unpolarised standards as in the quality reports of FORS2 (ESO)
 Limits      C = W (nothing but the catalogue is known of a star): M is infinite, the star is left out.
