@@ -18,6 +18,7 @@ from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, onl
 from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.diagnosis.refits import settled
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
@@ -113,16 +114,17 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     """Of three equally probable ones and e^−6.8 of that: all parameters would be smaller by what is left out."""
     result, context, _ = told
     laid = Laid(class_scene.examined())
-    real, rival = LinearStep.candidates, (((1.0, Change.parsed("gain of O1 * hours")),),)
+    sums = (((1.0, Change.parsed("gain of O1 * hours")),),)
 
-    def candidates(step, of_addition, alike):
-        (first, *_) = real(step, of_addition, alike)
-        for k, less in enumerate((0.0, 0.0, 6.8)):
-            change = first.change + 10.0 * (k + 1) * laid.errors
-            yield first._replace(name="", sums=rival, evidence=of_addition - less, change=change)
+    def candidates(step, addition, alike):
+        rival = step.member("", sums, laid.design.stacked([laid.columns.of(sums)]), np.array([3e-3]))
+        return addition.evidence, [
+            (rival._replace(evidence=addition.evidence - less, change=10.0 * k * laid.errors), False)
+            for k, less in enumerate((0.0, 0.0, 6.8), 1)
+        ]
 
     monkeypatch.setattr(LinearStep, "candidates", candidates)
-    monkeypatch.setattr(LinearStep, "in_other_kinds", lambda step, member: None)
+    monkeypatch.setattr(LinearStep, "in_other_kinds", lambda step, member, widths: None)
     (group,) = classes_of(laid, context, {TOLD: ()})
     assert len(group.members) == 4
     assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
@@ -188,8 +190,9 @@ def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_anot
     assert classes.additions == ()
 
 
-def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
+def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(monkeypatch):
     """Without the spot its depth is 0, and not its size. Fits chose the spot: no member is more probable."""
+    monkeypatch.setattr(Laid, "raised", lambda laid, evidence, best: max(evidence, best))
     spot = Blemish.of(SMALL.context(), x=0.1, y=0.05, size=0.1, depth=0.02)
     calset = simulate(SMALL, seed=5, effects=[spot]).calset
     context = effect_context(base_model(calset).template, calset.exposures)
@@ -209,6 +212,39 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot():
         assert values[shape] == fitted[shape]
     weight = spots.members[0].probability
     assert values["blemish.depth"] == pytest.approx(weight * fitted["blemish.depth"], rel=1e-9)
+
+
+def test_what_the_model_has_beside_an_addition_does_not_replace_it():
+    """Two things are there. "Without the first, and nothing in its place" is no explanation, whatever was reported."""
+    first, second = "gain of O1 * kind moon", "gain of O2 * hours"
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([first, second], [3e-3, 3.4e-3])]).calset
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([first, second], [0.0, 0.0])], context)
+    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
+    probes = Hypotheses(sentences=[probe for probe in asked if probe.name in (first, second)])
+    state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
+    groups = {first: (second,), second: (first,)}
+    (moon,) = ambiguities(state, context, groups).additions
+    assert [m.name for m in moon.members] == [first, "gain of O1 * kind clp; gain of O1 * kind standard"]
+    assert [m.probability for m in moon.members] == pytest.approx([0.5, 0.5])
+    # What the model had before is not in question.
+    assert ambiguities(state, context, {second: ()}, given=[first]).additions == ()
+
+
+def test_the_other_kinds_are_as_probable_whatever_the_size():
+    """An amplitude of five prior widths has a wider prior: the same one in the other exposures has that too."""
+    text = "gain of O1 * kind standard"
+    for size in (8e-3, 1.5e-2, 4e-2):
+        calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [size])]).calset
+        context = effect_context(base_model(calset).template, calset.exposures)
+        model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
+        asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        probes = Hypotheses(sentences=[probe for probe in asked if probe.name.startswith("gain of O1")])
+        result = settled(fit(Likelihood.of(calset, model)), [Described.name])
+        state = examine(result, probes, np.random.default_rng(0))
+        (found,) = ambiguities(state, context, {text: ()}).additions
+        sides = {m.name: m.probability for m in found.members}
+        assert sides["gain of O1 * kind clp; gain of O1 * kind moon"] == pytest.approx(sides[text])
 
 
 def test_the_product_is_read_as_it_was_written(told, tmp_path):

@@ -28,8 +28,11 @@ from walop_jax.diagnosis.readings import with_places
 from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
-from walop_jax.fit.refit import FitResult, refit
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.verdict import Hidden
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Described
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.specification import with_effects
@@ -203,6 +206,19 @@ def test_a_name_that_explains_no_more_than_a_stated_number_is_told_beside_it():
     (told,) = rival_conditions(Design.of(wrong), condition_scores(Design.of(wrong)), named.chi2)
     assert "one number that the set states would, if it were " in told
     assert "the equinox of RA and DEC 20" in told
+
+
+def test_far_from_the_data_a_stated_number_is_held_against_errors_as_given():
+    """A camera of 12 % more light on the Moon: χ²/dof of 470, which no latitude or DEC explains."""
+    text = "gain of O1 * kind moon"
+    calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [0.12])]).calset
+    base = base_model(calset)
+    wrong = fit(Likelihood.of(calset, base))
+    model = with_effects(base, [Described.saying([text], [0.12])], SMALL.context())
+    named = fit(Likelihood.of(calset, model))
+    assert wrong.noise_scale > 10.0
+    design = Design.of(wrong)
+    assert list(rival_conditions(design, condition_scores(design), named.chi2)) == []
 
 
 def an_hour_late(calset: CalibrationSet) -> CalibrationSet:

@@ -34,7 +34,8 @@ from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, signature
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
-from walop_jax.diagnosis.score import Matrix, Projector, Vector, log_bayes
+from walop_jax.diagnosis.hypotheses import sentences_of
+from walop_jax.diagnosis.score import FAINTEST, Matrix, Projector, Vector, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
@@ -49,21 +50,24 @@ LINEAR = 0.01  # relative error of the evidence of a linear step
 PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
-def classes_of(laid: Laid, context: Context, added: Mapping[str, Collection[str]]) -> tuple[ClassOf, ...]:
+def classes_of(
+    laid: Laid, context: Context, added: Mapping[str, Collection[str]], given: Collection[str] = ()
+) -> tuple[ClassOf, ...]:
     """The classes of what was added to a model, without those of a single member.
 
     `added` are effects and groups of sentences, by name, each with the candidates reported as indistinguishable from
-    it: with large residuals, where one linear step is inaccurate, these count as probable.
+    it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are sentences that
+    the model had before.
     """
     classes = (
         laid.class_of(words, at, lost, sums, added.get(name, ()))
-        for name, words, at, lost, sums in _additions(laid.fit, context, added)
+        for name, words, at, lost, sums in _additions(laid.fit, context, added, given)
     )
     return tuple(addition for addition in classes if addition.names)
 
 
 def _additions(
-    fit: FitResult, context: Context, added: Collection[str]
+    fit: FitResult, context: Context, added: Collection[str], given: Collection[str]
 ) -> Iterator[tuple[str, str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
     """Name as it was added and as it is in the model, positions among the free parameters, change of the data rows
     without it, its amplitudes."""
@@ -78,7 +82,7 @@ def _additions(
                 change = signature(fit, effect.name, context)
                 sums = tuple(map(tuple, effect.first_order(model.template)))
                 yield effect.name, effect.name, np.array(at), change, sums
-        for name, group in _groups(effect, groups) if groups and isinstance(effect, Described) else ():
+        for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
             at = [place[i] for i in indices if i in place]
             if not at:
@@ -89,9 +93,11 @@ def _additions(
             yield name, "; ".join(group), np.array(at), change, sums
 
 
-def _groups(effect: Described, groups: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Sentences of a model in the groups of their addition, by name; an ungrouped sentence is a group of its own."""
-    ungrouped = list(effect.sentences)
+def _groups(
+    effect: Described, groups: Sequence[str], given: Collection[str]
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Sentences that were added in their groups, by name; an ungrouped sentence is a group of its own."""
+    ungrouped = [text for text in effect.sentences if text not in given]
     for name in groups:
         group = tuple(text for text in ungrouped if text in name.split("; "))
         ungrouped = [text for text in ungrouped if text not in group]
@@ -155,29 +161,40 @@ class Laid:
         `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
         """
         step = LinearStep(self, at, lost)
-        addition = step.addition(name, sums)
-        # The addition is among the candidates: it is no further member.
-        rivals = (
-            member
-            for member in step.candidates(addition.evidence, alike)
-            if _texts(member.sums) != _texts(sums)
-        )
-        members = [addition, *rivals]
-        members += [twin for member in members if (twin := step.in_other_kinds(member)) is not None]
-        best = max(member.evidence for member in members)
-        least = best - thresholds.IMPROBABLE
+        addition, widths = step.addition(name, sums)
+        best, rivals = step.candidates(addition, alike)
         # Exact fits chose the addition: where it is less probable by one linear step, the step is inaccurate.
-        addition = addition._replace(evidence=best)
-        members = [addition, *(member for member in members[1:] if member.evidence > least)]
-        changes = np.stack([member.change for member in members])
-        evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
-        members = [members[i] for i in distinct(evidence, changes, self.errors, ALIKE)][:MOST_MEMBERS]
-        weights = special.softmax([member.evidence for member in members])
-        members = [
-            member._replace(probability=float(weight))
-            for member, weight in zip(members, weights, strict=True)
+        by_step, members = [addition, *(member for member, _ in rivals)], [addition._replace(evidence=best)]
+        for member, is_alike in rivals:
+            evidence = self.raised(member.evidence, best) if is_alike else member.evidence
+            members.append(member._replace(evidence=evidence))
+        # Of equivalent members the other kinds are asked once, as of those that nothing is equivalent to.
+        kept = self.distinct(members)
+        members = [members[i] for i in kept]
+        for i, member in zip(kept, list(members), strict=True):
+            if (twin := step.in_other_kinds(by_step[i], None if i else widths)) is not None:
+                members.append(twin._replace(evidence=member.evidence + twin.evidence))
+        chosen = [members[i] for i in self.distinct(members)][:MOST_MEMBERS]
+        chosen = [member for member in chosen if member.evidence > best - thresholds.IMPROBABLE]
+        weights = special.softmax([member.evidence for member in chosen])
+        chosen = [
+            member._replace(probability=float(weight)) for member, weight in zip(chosen, weights, strict=True)
         ]
-        return ClassOf(name, at, tuple(members), *self._spread(members))
+        return ClassOf(name, at, tuple(chosen), *self._spread(chosen))
+
+    def distinct(self, members: Sequence[Likeness]) -> list[int]:
+        """Members that differ in the matrix, the first and then the most probable ones."""
+        evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
+        return distinct(evidence, np.stack([member.change for member in members]), self.errors, ALIKE)
+
+    def raised(self, evidence: float, best: float) -> float:
+        """The evidence of a candidate that is reported as indistinguishable, within the error of a linear step.
+
+        With large residuals nothing is sure of that error: then it is as probable as the best.
+        """
+        if self.state.floor > 1.0:
+            return max(evidence, best)
+        return max(evidence, min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best))))
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
@@ -217,8 +234,8 @@ class LinearStep:
         self.projector = Projector(others, design.eliminated) if len(at) else design.projector
         self.left = self.projector(design.residual + self.lost)
 
-    def addition(self, name: str, sums: tuple[Sum, ...]) -> Likeness:
-        """The addition itself as a member, with its fitted values."""
+    def addition(self, name: str, sums: tuple[Sum, ...]) -> tuple[Likeness, Vector]:
+        """The addition itself as a member, with its fitted values, and its prior widths."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
         column = design.jacobian[:, self.at]
@@ -228,14 +245,21 @@ class LinearStep:
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / floor**2
         nothing = np.zeros(len(fit.model.free))
-        return Likeness(
+        member = Likeness(
             name, evidence, sums, np.zeros(0), np.zeros((0, 0)), nothing, np.zeros((len(nothing), 0)),
             np.zeros_like(self.laid.matrix),
         )  # fmt: skip
+        return member, widths
 
-    def candidates(self, of_addition: float, alike: Collection[str]) -> Iterator[Likeness]:
-        """Candidates not improbable relative to the addition, the most probable first; `alike` as in `class_of`."""
-        state, design = self.laid.state, self.laid.design
+    def candidates(
+        self, addition: Likeness, alike: Collection[str]
+    ) -> tuple[float, list[tuple[Likeness, bool]]]:
+        """The best evidence, and candidates not improbable relative to it; `alike` as in `class_of`.
+
+        True stands beside those that are among `alike`. What the model has beside the addition replaces nothing. Of a
+        group that was added, sentences that nothing shows were dropped since: the group is compared with other groups.
+        """
+        state, design, texts = self.laid.state, self.laid.design, _texts(addition.sums)
         projected = self.projector(design.jacobian[:, self.at])
         basis = projected @ whitening(projected.T @ projected)
         along = design.products(state.columns, basis)
@@ -243,30 +267,45 @@ class LinearStep:
         places, scored = state.bare.places(), []
         for probe in state.asked:
             at = places[probe.name]
-            evidence = log_bayes(gram[at, at], scores[at], probe.widths) / state.floor**2
-            if {probe.name, probe.effect.name} & set(alike):
-                square = gram[at, at] + np.diag(probe.widths**-2.0)
-                if np.abs(np.linalg.solve(square, scores[at]) / probe.widths).max() <= self.laid.largest:
-                    evidence = max(evidence, of_addition)
-            scored.append((evidence, probe))
+            square = gram[at, at]
+            if np.max(np.diag(square) * probe.widths**2, initial=0.0) < FAINTEST**2:
+                continue
+            evidence = log_bayes(square, scores[at], probe.widths) / state.floor**2
+            scored.append((evidence, bool({probe.name, probe.effect.name} & set(alike)), probe))
         scored.sort(key=lambda item: -item[0])
-        least = max(of_addition, scored[0][0] if scored else of_addition) - thresholds.IMPROBABLE
-        chosen = []
-        for evidence, probe in scored[:MOST_ASKED]:
-            if evidence <= least:
-                break
+        groups = (item for item in scored if item[2].effect is Described)
+        larger = [evidence for evidence, _, probe in groups if set(sentences_of(probe)) > texts]
+        best = max([min([addition.evidence, *larger[:1]]), *(evidence for evidence, *_ in scored[:1])])
+        least, chosen = best - thresholds.IMPROBABLE, []
+        for evidence, close, probe in scored:
+            if len(chosen) == MOST_ASKED or (evidence <= least and not close):
+                continue
+            at = places[probe.name]
+            covariance = np.linalg.inv(gram[at, at] + np.diag(probe.widths**-2.0))
+            amplitudes, sigma = -covariance @ scores[at], np.sqrt(np.diag(covariance))
+            close = close and bool(np.abs(amplitudes / probe.widths).max() <= self.laid.largest)
+            below = (amplitudes < -thresholds.SEPARATION * sigma)[probe.one_sided].any()
+            if below or (self.laid.raised(evidence, best) if close else evidence) <= least:
+                continue
             sums = tuple(
                 tuple(total) for member in probe.group for total in member.first_order(self.laid.template)
             )
-            if len(sums) == len(probe.widths) and self._can_be_said(sums):
-                chosen.append((probe, evidence, sums))
+            # The addition is among the candidates: it is no further member.
+            if len(sums) == len(probe.widths) and _texts(sums) != texts and self._can_be_said(sums):
+                chosen.append((probe, evidence, close, sums))
         self.laid.added([total for *_, sums in chosen for total in sums])  # all of them in one go
-        for probe, evidence, sums in chosen:
+        members = []
+        for probe, evidence, close, sums in chosen:
             column = design.stacked([state.candidates[probe.name].columns])
-            yield self.member(probe.name, sums, column, probe.widths, evidence)
+            members.append((self.member(probe.name, sums, column, probe.widths, evidence), close))
+        return best, members
 
-    def in_other_kinds(self, member: Likeness) -> Likeness | None:
-        """A member that is about exposures of one KIND, in all others instead; None for any other."""
+    def in_other_kinds(self, member: Likeness, widths: Vector | None = None) -> Likeness | None:
+        """A member that is about exposures of one KIND, in all others instead; None for any other.
+
+        Its `evidence` is relative to that of the member. `widths` are those of the priors of the member (None: those of
+        its sentences).
+        """
         kinds_by_sentence = [
             [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
             for amplitude in member.sums
@@ -287,14 +326,17 @@ class LinearStep:
             tuple((-size, elsewhere(sentence, new)) for size, sentence in amplitude for new in other_kinds)
             for amplitude in member.sums
         )
+        if not self._can_be_said(sums):
+            return None
         column = design.stacked([self.laid.columns.of(sums)])
-        widths = np.array([amplitude[0][1].width(self.laid.context.largest) for amplitude in sums])
+        if widths is None:
+            widths = np.array([amplitude[0][1].width(self.laid.context.largest) for amplitude in sums])
         name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
         twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
         near = abs(twin.evidence - member.evidence) < alike
-        return twin._replace(evidence=member.evidence) if near else twin
+        return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
 
     def member(
         self, name: str, sums: tuple[Sum, ...], column: Matrix, widths: Vector, evidence: float | None = None

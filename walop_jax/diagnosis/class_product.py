@@ -33,7 +33,7 @@ from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.optics import GENERATORS
-from walop_jax.model.specification import Model, effect_context, model_without, with_effects
+from walop_jax.model.specification import Model, effect_context, with_effects, with_sentences
 
 Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
@@ -218,15 +218,7 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
     if not texts:
         return model
     description = Described.saying(list(texts), np.zeros(len(texts)))
-    if Described.name in model.effect_names:
-        earlier = calibration.model.instrument(calibration.values).effect(Described.name)
-        assert isinstance(earlier, Described)
-        parameters = {p.name: p for p in model.parameters}
-        wider = with_effects(model_without(model, Described.name), [earlier.joined(description)], context)
-        return dataclasses.replace(
-            wider, parameters=tuple(parameters.get(p.name, p) for p in wider.parameters)
-        )
-    return with_effects(model, [description], context)
+    return with_sentences(model, description, context)
 
 
 def _derivatives(model: Model, effect: str, sums: Sequence[Sum]) -> Float[np.ndarray, "n a"]:

@@ -67,17 +67,18 @@ def ambiguities(
     state: Examination,
     context: Context,
     added: Mapping[str, Collection[str]],
+    given: Collection[str] = (),
 ) -> Classes:
     """Classes of the additions to a model, shapes of its descriptions, and undetected changes.
 
     `added` are effects and groups of sentences, by name, each with the candidates that are reported as
-    indistinguishable from it (`class_members.classes_of`).
+    indistinguishable from it, `given` sentences that the model had before (`class_members.classes_of`).
     """
     if not state.result.model.template.cameras.pairs:
         return Classes()
     laid = Laid(state)
     return Classes(
-        additions=classes_of(laid, context, added),
+        additions=classes_of(laid, context, added, given),
         shape=shape_of(laid) if added else None,
         undetected=undetected(laid),
     )

@@ -39,7 +39,7 @@ from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import Model, effect_context, model_without, with_effects
+from walop_jax.model.specification import Model, effect_context, model_without, with_effects, with_sentences
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,12 +138,8 @@ def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes
 
 def try_sentences(base: FitResult, description: Described, context: Context, count: int) -> Trial:
     """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
-    model = base.model
-    if Described.name in model.effect_names:
-        earlier = model.instrument(base.values).effect(Described.name)
-        assert isinstance(earlier, Described)
-        description, model = earlier.joined(description), model_without(model, Described.name)
-    return try_model(base, Described, with_effects(model, [description], context), base.values, count)
+    model = with_sentences(base.model, description, context)
+    return try_model(base, Described, model, base.values, count)
 
 
 def try_model(

@@ -25,10 +25,12 @@ def rival_conditions(design: Design, conditions: Sequence[ScoredNumber], chi2: f
     `design` is of the fit before anything was added to its model, `conditions` are its `condition_scores`.
     """
     scored = [item for item in conditions if item.score.testable]
+    scored = [item for item in scored if abs(item.score.amplitudes[0]) < item.stated.width]
+    errors = design.fit.noise_scale**2  # of the scores; those of `chi2` are as given
     square = float(np.sum(design.projector(design.residual) ** 2))
     least = special.chdtri(1, local_p(thresholds.ALARM, len(scored))) if scored else np.inf
     gains = [(float(item.score.amplitudes[0]) ** 2 * item.square, item) for item in scored]
-    alike = [(gain, item) for gain, item in gains if square - gain < chi2 + ALIKE and gain > least]
+    alike = [(gain, item) for gain, item in gains if (square - gain) * errors < chi2 + ALIKE and gain > least]
     if alike:
         alike.sort(key=lambda pair: -pair[0])
         shown = alike[: thresholds.SHOWN]

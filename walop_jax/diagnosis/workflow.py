@@ -126,6 +126,8 @@ def diagnose(
         names = tuple(trial.groups) or (step.effect,)
         alone = {*step.equivalent, *step.nameless} - {Described.name}
         alike |= {names[0]: alone} if len(names) == 1 else trial.groups
+    first_effects = before.model.template.effects
+    given = [text for e in first_effects if isinstance(e, Described) for text in e.sentences]
     diagnosis = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -147,7 +149,7 @@ def diagnose(
         ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
-        members=ambiguities(evidence, context, alike),
+        members=ambiguities(evidence, context, alike, given),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),
