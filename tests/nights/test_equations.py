@@ -89,9 +89,6 @@ def test_files_of_one_night_without_a_longitude_are_of_one_night():
     assert set(night_of(first, np.nan)) == set(night_of(second, np.nan)) == {59000.0}
     two = np.array([59001.05, 59001.15, 59001.95, 59002.1])
     assert night_of(two, np.nan).tolist() == [59000, 59000, 59001, 59001]
-    # A laboratory day and night: the gap of nine hours in three days parts them.
-    long = np.concatenate([np.arange(0.0, 1.5, 0.1), np.arange(1.9, 3.0, 0.1)]) + 59000.0
-    assert night_of(long, np.nan).tolist() == [59000.0] * 15 + [59001.0] * 11
 
 
 def test_nights_that_overlap_are_refused(nights):

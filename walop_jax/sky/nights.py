@@ -5,8 +5,7 @@ A night lasts from noon to noon of the mean Sun at the site, and has the MJD of 
     night = ⌊MJD + λ/360° − ½⌋        λ the longitude, east positive, −180° to 180°
 
 Where the longitude is not known, noon is the middle of the longest part of the day without an exposure. Exposures of
-the same night in another file may then make another noon: with the longitude they cannot. Where no part of the day is
-without exposures for `GAP` hours, gaps of that length part two nights, which have the MJD of their first exposures.
+the same night in another file may then make another noon: with the longitude they cannot.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 GAP = 8.0
+"""Hours without an exposure between two nights, for changes that begin anew with each."""
 FIRST_DATE = 30000.0
 """MJD (1941) up to which times are no dates but numbers of exposures or of groups."""
 
@@ -27,15 +27,9 @@ def night_of(mjd: Float[np.ndarray, " e"], longitude: float) -> Float[np.ndarray
     if not len(dated):
         return night
     of_day = np.unique(mjd[dated] % 1.0)
-    gaps = np.diff(of_day, append=of_day[0] + 1.0)
+    gaps = np.diff(of_day, append=of_day[:1] + 1.0)
     longest = int(np.argmax(gaps))
-    if gaps[longest] > GAP / 24.0:
-        noon = (of_day[longest] + 0.5 * gaps[longest]) % 1.0
-        night[dated] = np.floor(mjd[dated] - noon)
-        return night
-    order = dated[np.argsort(mjd[dated], kind="stable")]
-    first = first_of_nights(mjd[order])
-    night[order] = np.repeat(np.floor(mjd[order][first]), np.diff(np.append(first, len(order))))
+    night[dated] = np.floor(mjd[dated] - (of_day[longest] + 0.5 * gaps[longest]) % 1.0)
     return night
 
 
