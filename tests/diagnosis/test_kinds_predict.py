@@ -1,10 +1,20 @@
 """Polariser, Moon and standards predict each other: ln p of each given the others, by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
+from small_run import SMALL
 
-from walop_jax.diagnosis.refits import gains_of_units
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.refits import before_and_after, gains_of_units
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.specification import with_effects
+from walop_jax.simulation.simulate import effect_from_text, simulate
 
 UNIT = np.repeat(["clp", "moon", "standard"], 100)
 
@@ -62,3 +72,29 @@ def test_errors_that_a_fit_has_scaled_make_its_densities_as_broad():
     # ½ Σ r² − n ln 5 − ½ Σ r²/25, nearly: a unit of 100 rows is predicted by 200.
     squares = np.array([np.sum(residual[kind == UNIT] ** 2) for kind in np.unique(UNIT)])
     np.testing.assert_allclose(loss, 0.5 * squares * (1 - 1 / 25) - 100 * np.log(5.0), rtol=0.02)
+
+
+def test_an_effect_of_single_exposures_is_held_against_places_in_the_field():
+    """Three patches of the Moon, each in one exposure: the others say nothing of it, other field points do."""
+    patches = effect_from_text("moon_patch=q:0.004/0.006/0.009,u:0.003/0.005/0.007", SMALL.context())
+    calset = simulate(SMALL, seed=3, effects=[patches]).calset
+    before = fit(Likelihood.of(calset, base_model(calset)))
+    model = with_effects(before.model, [patches], SMALL.context())
+    found = before_and_after("moon_patch", Design.of(before), Design.of(fit(Likelihood.of(calset, model))))
+    assert found["heldout_scheme"] == "field blocks"
+    assert found["heldout_after"] < found["heldout_before"]
+    model = with_effects(
+        before.model, ["moon_multiple_scattering"], SMALL.context()
+    )  # one number of all patches
+    other = fit(Likelihood.of(calset, model))
+    found = before_and_after("moon_multiple_scattering", Design.of(before), Design.of(other))
+    assert found["heldout_scheme"] == "exposures"
+
+
+def test_patches_of_the_moon_are_named_though_no_exposure_predicts_another():
+    """Moonlight that is more polarised from patch to patch: every step of the search asks other field points."""
+    plan = dataclasses.replace(SMALL, moon_patches=6)
+    text = "moon_patch=q:0.004/0.005/0.006/0.007/0.008/0.009,u:0.003/0.004/0.005/0.006/0.007/0.008"
+    found = diagnose(simulate(plan, seed=3, effects=[effect_from_text(text, plan.context())]).calset)
+    assert found.verdict == "effect_found"
+    assert [step.effect for step in found.steps] == ["moon_patch"]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar, thresholds
-from walop_jax.diagnosis.design import Design, held_out
+from walop_jax.diagnosis.design import Design, exposure_folds, held_out
 from walop_jax.diagnosis.exact import (
     Trial,
     other_descriptions,
@@ -216,11 +216,9 @@ LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
     """The fields of a `Step` that compare the fits without and with an effect."""
-    effect = after.fit.model.instrument(after.fit.values).effect(name)
-    # An effect with a number for every exposure, or for one of them, cannot predict exposures that it has not seen.
+    effect = after.fit.model.template.effect(name)
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
-    many |= isinstance(effect, Described) and any("exposure" in text for text in effect.sentences)
-    scheme = "field blocks" if many else "exposures"
+    scheme = "field blocks" if many or _of_one_fold(after, name) else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
     return {
         "chi2_before": before.fit.chi2,
@@ -233,6 +231,15 @@ def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]
         "residual_before": before.measured.residual,
         "residual_after": after.measured.residual,
     }
+
+
+def _of_one_fold(design: Design, name: str) -> bool:
+    """True of an effect with an amplitude that only exposures of one fold show: others do not predict these."""
+    place = {int(i): k for k, i in enumerate(design.fit.model.free)}
+    at = [place[int(i)] for i in design.fit.model.positions(name) if int(i) in place]
+    square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
+    of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
+    return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) < 2))
 
 
 def predicts_unseen(

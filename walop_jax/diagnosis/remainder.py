@@ -192,14 +192,17 @@ def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...])
 
 
 def _worse(first: Examination, state: State) -> str:
-    """Exposures that the final model predicts worse than the first, in words; empty: none."""
+    """Data that the final model predicts worse than the first, in words; empty: none."""
     if kinds := contradicting(first.design, state.evidence.design):
         return f"exposures of {kinds}, as all others predict them"
     if not state.steps:  # numbers of a free-form term for single exposures predict no others
         return ""
-    before, after = (held_out(evidence.design, "exposures") for evidence in (first, state.evidence))
+    # A number for every exposure predicts no exposure that is left out, but places in the field.
+    schemes = [step.compared["heldout_scheme"] for step in state.steps]
+    scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
+    before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
-        return f"exposures that are left out (mean squared residual {before:.3g} → {after:.3g})"
+        return f"{scheme} that are left out (mean squared residual {before:.3g} → {after:.3g})"
     return ""
 
 

@@ -285,6 +285,7 @@ def _grows_added(instrument: Instrument, change: Change) -> Grows:
         Combinations(("tilt", "r2")),  # uniform over the field it is diattenuation
         Combinations(("even", "tilt", "r2"), SLOW),
         Combinations(along=(*SINGLE, "kind")),
+        Combinations(("smooth",), ("kind",)),  # the sky beside the Moon differs from point to point
     )
     return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
 
