@@ -72,5 +72,5 @@ def test_what_is_left_of_a_covariance_once_some_numbers_are_known():
 def test_members_that_do_the_same_count_once_the_most_probable_of_them():
     errors, evidence = np.full((2, 1), 0.1), np.array([1.0, 2.0, 0.5])
     changes = np.array([[[1.0], [1.0]], [[1.01], [0.99]], [[0.0], [1.0]]])
-    assert average.distinct(evidence, changes, errors, 0.3) == [1, 2]
-    assert average.distinct(evidence, changes, errors, 0.01) == [1, 0, 2]
+    assert average.distinct(evidence, changes, errors, 0.3) == [[1, 0], [2]]
+    assert average.distinct(evidence, changes, errors, 0.01) == [[1], [0], [2]]

@@ -231,6 +231,25 @@ def test_what_the_model_has_beside_an_addition_does_not_replace_it():
     assert ambiguities(state, context, {second: ()}, given=[first]).additions == ()
 
 
+def test_a_time_that_is_the_time_of_one_kind_may_be_that_kind():
+    """All exposures of standards are the last ones: a step in time, or standards, or all others the other way."""
+    calset = simulate(
+        SMALL, seed=3, effects=[Described.saying(["gain of O1 * kind standard"], [3e-3])]
+    ).calset
+    e = calset.exposures
+    hours = 24.0 * (e.mjd - e.mjd.min())
+    start = 0.5 * (hours[e.kind == "standard"].min() + hours[e.kind != "standard"].max())
+    text = f"gain of O1 * {grammar.between(start, grammar.end_of(e))}"
+    context = effect_context(base_model(calset).template, calset.exposures)
+    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
+    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
+    probes = Hypotheses(sentences=[probe for probe in asked if probe.name == "gain of O1 * kind standard"])
+    state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
+    (found,) = ambiguities(state, context, {text: ()}).additions
+    assert [m.name for m in found.members] == [text, "gain of O1 * kind clp; gain of O1 * kind moon"]
+    assert found.members[1].probability == pytest.approx(0.5, abs=0.05)
+
+
 def test_the_other_kinds_are_as_probable_whatever_the_size():
     """An amplitude of five prior widths has a wider prior: the same one in the other exposures has that too."""
     text = "gain of O1 * kind standard"

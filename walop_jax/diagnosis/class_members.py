@@ -168,13 +168,14 @@ class Laid:
         for member, is_alike in rivals:
             evidence = self.raised(member.evidence, best) if is_alike else member.evidence
             members.append(member._replace(evidence=evidence))
+        groups = self.distinct(members)
+        both = [members[group[0]] for group in groups]
         # Of equivalent members the other kinds are asked once, as of those that nothing is equivalent to.
-        kept = self.distinct(members)
-        members = [members[i] for i in kept]
-        for i, member in zip(kept, list(members), strict=True):
-            if (twin := step.in_other_kinds(by_step[i], None if i else widths)) is not None:
-                members.append(twin._replace(evidence=member.evidence + twin.evidence))
-        chosen = [members[i] for i in self.distinct(members)][:MOST_MEMBERS]
+        for group in groups:
+            twins = (step.in_other_kinds(by_step[i], None if i else widths) for i in group)
+            if (twin := next(filter(None, twins), None)) is not None:
+                both.append(twin._replace(evidence=members[group[0]].evidence + twin.evidence))
+        chosen = [both[group[0]] for group in self.distinct(both)][:MOST_MEMBERS]
         chosen = [member for member in chosen if member.evidence > best - thresholds.IMPROBABLE]
         weights = special.softmax([member.evidence for member in chosen])
         chosen = [
@@ -182,8 +183,8 @@ class Laid:
         ]
         return ClassOf(name, at, tuple(chosen), *self._spread(chosen))
 
-    def distinct(self, members: Sequence[Likeness]) -> list[int]:
-        """Members that differ in the matrix, the first and then the most probable ones."""
+    def distinct(self, members: Sequence[Likeness]) -> list[list[int]]:
+        """Groups of members that are equivalent in the matrix, that of the first ahead, then the most probable."""
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         return distinct(evidence, np.stack([member.change for member in members]), self.errors, ALIKE)
 

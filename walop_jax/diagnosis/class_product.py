@@ -306,18 +306,18 @@ def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
 
 def distinct(
     evidence: Vector, changes: Float[np.ndarray, "k p m"], errors: Float[np.ndarray, "p m"], alike: float
-) -> list[int]:
-    """Models with different changes, the most probable of each group of equivalent ones, best first.
+) -> list[list[int]]:
+    """Groups of equivalent models, the most probable of each first; best groups first.
 
     Two are equivalent where their changes differ by less than `alike` of the errors, rms over places, in every element.
     """
     scale = np.where(errors > 0, errors, np.inf)
-    chosen: list[int] = []
+    groups: list[list[int]] = []
     for k in np.argsort(-evidence, kind="stable").tolist():
-        apart = (np.sqrt(np.mean(((changes[k] - changes[j]) / scale) ** 2, axis=0)).max() for j in chosen)
-        if all(distance >= alike for distance in apart):
-            chosen.append(k)
-    return chosen
+        apart = (np.sqrt(np.mean(((changes[k] - changes[g[0]]) / scale) ** 2, axis=0)).max() for g in groups)
+        same = next((group for group, distance in zip(groups, apart, strict=True) if distance < alike), None)
+        groups.append([k]) if same is None else same.append(k)
+    return groups
 
 
 def _dominates(spread: float, stated: float) -> bool:

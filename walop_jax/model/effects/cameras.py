@@ -186,7 +186,7 @@ _CAMERA = (
     Combinations(("smooth",), (*SLOW, *SINGLE, "kind", "side"), ("alone", "arm")),
 )
 _ARM = (
-    Combinations(along=(*SLOW, *SINGLE, "night")),
+    Combinations(along=(*SLOW, *SINGLE, "side", "night", "step", "kind")),
     Combinations(("rings",)),
     Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
 )
