@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2661,
     "posterior": 2180,
     "science": 5822,
-    "diagnosis": 7942,
+    "diagnosis": 7943,
     "nights": 2598,
     "plans": 2198,
     "paper": 775,

@@ -239,7 +239,7 @@ def _of_one_fold(design: Design, name: str) -> bool:
     at = [place[int(i)] for i in design.fit.model.positions(name) if int(i) in place]
     square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
     of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
-    return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) < 2))
+    return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) == 1))
 
 
 def predicts_unseen(
