@@ -32,7 +32,7 @@ from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, signature
-from walop_jax.diagnosis.examination import Examination
+from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import sentences_of
 from walop_jax.diagnosis.score import FAINTEST, Matrix, Projector, Vector, log_bayes
@@ -194,8 +194,8 @@ class Laid:
         With large residuals nothing is sure of that error: then it is as probable as the best.
         """
         if self.state.floor > 1.0:
-            return max(evidence, best)
-        return max(evidence, min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best))))
+            return best
+        return min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best)))
 
     def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
@@ -283,10 +283,10 @@ class LinearStep:
                 continue
             at = places[probe.name]
             covariance = np.linalg.inv(gram[at, at] + np.diag(probe.widths**-2.0))
-            amplitudes, sigma = -covariance @ scores[at], np.sqrt(np.diag(covariance))
+            amplitudes = -covariance @ scores[at]
             close = close and bool(np.abs(amplitudes / probe.widths).max() <= self.laid.largest)
-            below = (amplitudes < -thresholds.SEPARATION * sigma)[probe.one_sided].any()
-            if below or (self.laid.raised(evidence, best) if close else evidence) <= least:
+            likely = (self.laid.raised(evidence, best) if close else evidence) > least
+            if not likely or not follow_physics(probe, amplitudes, covariance):
                 continue
             sums = tuple(
                 tuple(total) for member in probe.group for total in member.first_order(self.laid.template)

@@ -51,7 +51,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
     for effect, shapes in by_effect.items():
-        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s)]
+        alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s.amplitudes, s.covariance)]
         if not alive:
             continue
         alive.sort(key=lambda item: -item[1].log_bayes)
@@ -73,10 +73,10 @@ def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
     return [item for item in ranked[: thresholds.MOST_LEADERS] if item.log_bayes > best - reach]
 
 
-def follow_physics(probe: Probe, score: Score) -> bool:
+def follow_physics(probe: Probe, amplitudes: Vector, covariance: Matrix) -> bool:
     """True if a linear step leaves one-sided amplitudes on their side, within `thresholds.SEPARATION`."""
-    sigma = np.sqrt(np.clip(np.diag(score.covariance), 0.0, None))
-    return bool(np.all((score.amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
+    sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+    return bool(np.all((amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
 
 
 def shortest(item: Ranked) -> Described:

@@ -205,9 +205,8 @@ def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     if not change.any():
         return one
     law = system.laws[i]
-    if (
-        one.kind == "step" and law is not None and law.base == "interval"
-    ):  # values before and after, no change
+    # Intervals have values before and after, and no change.
+    if one.kind == "step" and law is not None and law.base == "interval":
         change -= [f is not None and f.stop == form.start for f in forms]
     error = scale * math.sqrt(change @ solution.covariance @ change)
     return dataclasses.replace(one, size=scale * float(change @ solution.shared), error=error)

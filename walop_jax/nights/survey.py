@@ -247,21 +247,20 @@ class Survey(Drawn):
         select[[model.index(names[k]) for k in present], np.arange(len(present))] = 1.0
         select = select[model.masters]
         inside = select.any(axis=1)
-        total = select @ covariance[np.ix_(present, present)] @ select.T
-        # Nights do not show the deviations in the errors of the reference.
-        of_reference = [model.index(name) for name in self.reference.model.names]
-        total[np.ix_(of_reference, of_reference)] += self.reference.of_deviations
         return dataclasses.replace(
             full,
             values=np.where(inside, select @ value[present], full.values),
-            covariance=total,
+            covariance=full.covariance + select @ covariance[np.ix_(present, present)] @ select.T,
             origin=f"{len(self.data.nights)} nights, stacked, at MJD {mjd:.5f}",
             inputs=(),
         )
 
     @functools.cached_property
     def _full(self) -> Calibration:
-        """The calibration with the effects that laws have added to its model, at neutral."""
+        """The calibration with the effects that laws have added to its model, at neutral.
+
+        Its covariance is that of deviations alone, which nights do not show.
+        """
         like = self.reference
         model = like.model
         context = effect_context(model.template, like.exposures)
@@ -279,7 +278,9 @@ class Survey(Drawn):
                 model = with_effects(model, [groups[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values
-        return dataclasses.replace(like, model=model, values=values, covariance=np.zeros((len(values),) * 2))
+        covariance = np.zeros((len(values),) * 2)
+        covariance[np.ix_(old, old)] = like.of_deviations
+        return dataclasses.replace(like, model=model, values=values, covariance=covariance)
 
     # --------------------------------------------------------------------------------------------------- tables
 
