@@ -201,7 +201,7 @@ MOST_LINES = {
     "model": 9507,
     "likelihood": 3310,
     "simulation": 1089,
-    "fit": 2047,
+    "fit": 2102,
     "calibration": 2661,
     "posterior": 2180,
     "science": 5822,

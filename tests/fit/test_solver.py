@@ -162,6 +162,70 @@ def test_a_curved_valley_that_a_prior_closes_is_gone_along():
     np.testing.assert_allclose(found.x, root, atol=1e-7)
 
 
+def brown_and_dennis():
+    """Problem 16 of Moré, Garbow & Hillstrom 1981 (ACM TOMS 7, 17), from its start: minimum 85822.2."""
+    t = np.arange(1, 21) / 5.0
+
+    def parts(x):
+        return x[0] + t * x[1] - np.exp(t), x[2] + x[3] * np.sin(t) - np.cos(t)
+
+    def jacobian(x):
+        a, b = parts(x)
+        return 2.0 * np.stack([a, a * t, b, b * np.sin(t)], axis=1)
+
+    return Squares(lambda x: sum(part**2 for part in parts(x)), jacobian), np.array([25.0, 5.0, -5.0, -1.0])
+
+
+def test_the_curvature_of_large_residuals_is_learnt_from_gradients():
+    looked = []
+    for secant in (False, True):
+        squares, start = brown_and_dennis()
+        found = minimise(squares, start, np.ones(4), secant=secant)
+        assert found.converged
+        assert found.expansion.objective == pytest.approx(85822.2, abs=0.05)
+        looked.append(squares.looked)
+    assert looked[1] < 0.7 * looked[0]
+
+
+@pytest.mark.parametrize("bend", [0.5, -0.5, -4.0])
+def test_gauss_newton_alone_closes_in_slowly_where_residuals_stay(bend):
+    """Dennis & Schnabel 1983, example 10.2.4: x + 1 and bend x² + x − 1, minimum at 0, there JᵀJ = 2, S = −2 bend."""
+    looked = []
+    for secant in (False, True):
+        squares = Squares(
+            lambda x: np.array([x[0] + 1.0, bend * x[0] ** 2 + x[0] - 1.0]),
+            lambda x: np.array([[1.0], [2.0 * bend * x[0] + 1.0]]),
+        )
+        found = minimise(squares, np.array([0.1]), np.ones(1), damping=0.0, secant=secant)
+        np.testing.assert_allclose(found.x, 0.0, atol=1e-4)
+        looked.append(squares.looked)
+    assert looked[1] <= 0.6 * looked[0]
+
+
+def test_without_residuals_the_secant_changes_little():
+    looked = []
+    for secant in (False, True):
+        squares = rosenbrock()
+        found = minimise(squares, np.array([-1.2, 1.0]), np.ones(2), secant=secant)
+        np.testing.assert_allclose(found.x, 1.0, atol=1e-4)
+        looked.append(squares.looked)
+    assert looked[1] <= 1.2 * looked[0]
+
+
+def test_the_secant_does_not_depend_on_units():
+    """The same problem in other units: the same steps, as far as λ = 0 goes."""
+    unit, places = np.array([1e-3, 1.0, 1e4, 10.0]), []
+    for scale in (np.ones(4), unit):
+        squares, start = brown_and_dennis()
+        scaled = Squares(
+            lambda x, s=squares, u=scale: s.residuals(x / u),
+            lambda x, s=squares, u=scale: s.jacobian(x / u) / u,
+        )
+        found = minimise(scaled, start * scale, scale, damping=0.0, secant=True)
+        places.append(found.history)
+    np.testing.assert_allclose(places[1], places[0], rtol=1e-6)
+
+
 def test_the_steps_are_those_of_optimistix():
     """Its Levenberg–Marquardt on the residuals themselves, with the same region, for as many steps: the same place."""
 

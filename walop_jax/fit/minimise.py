@@ -5,6 +5,9 @@ the host, since a pass may read files, in parameters scaled to their prior width
 
 Step        δ = −(JᵀJ + λ)⁻¹ Jᵀr, λ following optimistix' classical trust region from `damping` on. A start that may be
             far away takes λ = 1; one near the minimum λ = 0, the Newton step, until a step leads upwards.
+Curvature   Σ rᵢ ∇²rᵢ, which JᵀJ lacks, decides along directions that the data hardly see: a hundred steps to and fro.
+            With `secant` it is S, made from the gradients of successive places, and steps are −(JᵀJ + S + λ)⁻¹ Jᵀr
+            where S would have predicted the last change of the objective better than JᵀJ alone.
 Stop        `TOLERANCE`: the scaled gradient d = ‖(JᵀJ)^(−½) Jᵀr‖, the distance to the minimum in standard errors. A
             Newton step is not looked at if d²/d₋₁, which steps that close in at a constant rate leave, is that small
             (d₋₁: the distance at the place before).
@@ -31,7 +34,10 @@ from jaxtyping import Float
 
 from walop_jax.model.compiled import compiled
 
-SOURCE = "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods"
+SOURCE = (
+    "Moré 1978, Lecture Notes in Mathematics 630, 105; Conn, Gould & Toint 2000, Trust Region Methods; "
+    "Dennis, Gay & Welsch 1981, ACM Trans. Math. Software 7, 348"
+)
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -106,19 +112,21 @@ def minimise(
     maximum_steps: int = MAXIMUM_STEPS,
     tolerance: float = TOLERANCE,
     far_off: Callable[[Place], bool] = lambda _: False,
+    secant: bool = False,
     progress: Callable[[int, Place], None] | None = None,
 ) -> Minimum[Place]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
     `evaluate(x)` gives the objective and its expansion at x, `far_off` whether the model of an expansion is hopelessly
-    far from the data; `progress(step, expansion)` is given the best one after each of at most `maximum_steps` places,
-    the start among them. Where the last step is not looked at, `scaled_gradient` is the one to be expected, and the
-    expansion that of the place before. Never raises for a numerical outcome: the gates, `result` and `message` say what
-    happened.
+    far from the data; `secant` is for searches that Gauss–Newton steps alone did not end; `progress(step, expansion)`
+    is given the best one after each of at most `maximum_steps` places, the start among them. Where the last step is not
+    looked at, `scaled_gradient` is the one to be expected, and the expansion that of the place before. Never raises for
+    a numerical outcome: the gates, `result` and `message` say what happened.
     """
     x = trial = np.asarray(start, float)
     size = 1.0 / damping if damping > 0 else np.inf
-    current, step, history = None, np.zeros(len(x)), []
+    current, model, step, history = None, None, np.zeros(len(x)), []
+    curvature, bent = np.zeros((len(x), len(x))), False
     distance, before, condition = np.inf, np.inf, np.inf
     result = RESULTS.nonlinear_max_steps_reached
     while len(history) < maximum_steps:
@@ -128,17 +136,20 @@ def minimise(
             current, result = candidate, RESULTS.nonfinite
             break
         lowered = current is None or candidate.objective < current.objective
-        size, accept = _judged(step, current, candidate, size)
+        size, accept = _judged(step, model, candidate, size)
+        if secant and current is not None:
+            bent = _predicts_better(curvature, step, current, candidate)
+            curvature = _secant(curvature, step, current, candidate)
         if current is None or accept:
             x, current, before = trial, candidate, distance
             distance, condition = distance_to_minimum(candidate)
         if progress is not None:
             progress(len(history), current)
-        step = _step(current, scale, 1.0 / size)
+        step, model = _step(current, curvature if bent else None, scale, 1.0 / size)
         remaining = distance**2 / before if accept and np.isinf(size) and np.isfinite(before) else np.inf
         rough = far_off(current) and distance < ROUGH and (before < ROUGH or len(history) == maximum_steps)
         smallest = ROUNDING * abs(current.objective)
-        last = not lowered and -_change(step, current) < smallest
+        last = not lowered and -_change(step, model) < smallest
         if min(distance, remaining) < tolerance or rough or (last and distance**2 < smallest):
             if tolerance <= distance and remaining < tolerance:
                 x, distance = x + step, remaining
@@ -183,15 +194,58 @@ def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:
     return float(np.sqrt(np.sum(along[positive] ** 2 / value[positive]))), condition
 
 
-def _step(here: Quadratic, scale: Vector, damping: float) -> Vector:
-    """−(JᵀJ + λ)⁻¹ Jᵀr; not a number where that matrix is singular."""
+@dataclasses.dataclass(frozen=True)
+class _Bent:
+    """A quadratic whose matrix is not JᵀJ alone."""
+
+    objective: float
+    gradient: Vector
+    matrix: Matrix
+
+
+def _step(
+    here: Quadratic, curvature: Matrix | None, scale: Vector, damping: float
+) -> tuple[Vector, Quadratic]:
+    """−(H + λ)⁻¹ Jᵀr, and the quadratic with H = JᵀJ + S; H = JᵀJ without S, or where that sum has no minimum.
+
+    The step is not a number where the matrix is singular.
+    """
     if not len(scale):  # before SciPy 1.14 nothing was solved for nothing
-        return np.zeros(0)
-    try:
-        factors = scipy.linalg.cho_factor(here.matrix + np.diag(damping / scale**2), check_finite=False)
-    except np.linalg.LinAlgError:
-        return np.full(len(scale), np.nan)
-    return -scipy.linalg.cho_solve(factors, here.gradient, check_finite=False)
+        return np.zeros(0), here
+    models = [here]
+    if curvature is not None:
+        models.insert(0, _Bent(here.objective, here.gradient, here.matrix + curvature))
+    for model in models:
+        try:
+            factors = scipy.linalg.cho_factor(model.matrix + np.diag(damping / scale**2), check_finite=False)
+        except np.linalg.LinAlgError:
+            continue
+        return -scipy.linalg.cho_solve(factors, model.gradient, check_finite=False), model
+    return np.full(len(scale), np.nan), here
+
+
+def _predicts_better(curvature: Matrix, step: Vector, here: Quadratic, there: Quadratic) -> bool:
+    """True if S would have made the predicted change of the objective by a step less wrong."""
+    wrong = there.objective - here.objective - _change(step, here)
+    return abs(wrong - float(step @ curvature @ step)) < abs(wrong)
+
+
+def _secant(curvature: Matrix, step: Vector, here: Quadratic, there: Quadratic) -> Matrix:
+    """S after a step s: the symmetric matrix nearest to the old one with S s = y − JᵀJ s, JᵀJ that of the new place.
+
+    y is the change of the gradient. Nearest is meant in the metric of a matrix that maps s to y, so that the units of
+    the parameters do not matter. Before that S is reduced to its size along s: without residuals it goes to 0. Source:
+    Dennis, Gay & Welsch 1981; they have (J − J₀)ᵀr on the right, but the old J₀ is not kept here.
+    """
+    y = there.gradient - here.gradient
+    wanted, along = y - there.matrix @ step, float(y @ step)
+    if not along > 0.0:  # no positive matrix has this secant; or not a number
+        return curvature
+    before = abs(float(step @ curvature @ step))
+    curvature = curvature * (min(1.0, abs(float(step @ wanted)) / before) if before > 0.0 else 1.0)
+    off = wanted - curvature @ step
+    outer = np.outer(off, y)
+    return curvature + (outer + outer.T) / along - float(off @ step) / along**2 * np.outer(y, y)
 
 
 def _change(step: Vector, here: Quadratic) -> float:

@@ -161,7 +161,8 @@ def _from_afar(
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
     promising = best.expansion.objective < worth if worth is not None else best.expansion.misfit < FAR_OFF
     if not best.converged and promising:
-        best = _search(likelihood, "fit, continued", best.x, scale, best.expansion, damping=0.0)
+        how = {"damping": 0.0, "secant": True}
+        best = _search(likelihood, "fit, continued", best.x, scale, best.expansion, **how)
     if noise_scale is not None or best.expansion.misfit < FAR_OFF:
         return best
     return _far_off(likelihood, best)
