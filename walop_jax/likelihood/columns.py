@@ -235,7 +235,7 @@ class Columns:
         inside = (term.slot[0] != "light" and "colour" in term.factors for term in terms)
         if any(inside) or not all(self._holds(term.slot) for term in terms):
             raise NoSlotError(sentence.text)
-        if sentence.kind != "thermal" or "temperature" in self.plan.conditions.planned:
+        if sentence.kind != "thermal" or self.plan.conditions.holds("temperature"):
             return terms
         return [term._replace(factors=(*term.factors, "kelvin")) for term in terms]
 

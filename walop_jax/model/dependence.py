@@ -29,7 +29,7 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import by_shapes, parameter_places
 from walop_jax.model.plan import Plan, blank_plan
-from walop_jax.model.ray import NotPlannedError, Ray
+from walop_jax.model.ray import SMOOTH, NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays, Sight
 
 AT = 0.11, 0.07
@@ -37,9 +37,13 @@ AT = 0.11, 0.07
 
 
 class Needs(NamedTuple):
-    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow."""
+    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow.
+
+    `smooth` are the conditions on which the optics depend smoothly.
+    """
 
     conditions: frozenset[str]
+    smooth: frozenset[str]
     median: bool
     path_difference: float  # µm
 
@@ -60,7 +64,8 @@ def needs(instrument: Instrument) -> Needs:
 
     (patched, _), quantities = _asking(run, instrument)
     longest = max((element.path_difference for element in patched.by_place().values()), default=0.0)
-    return Needs(quantities - {"median"}, "median" in quantities, longest)
+    exact, smooth = _sorted_out(quantities - {"median"})
+    return Needs(exact | smooth, smooth - exact, "median" in quantities, longest)
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
@@ -70,9 +75,15 @@ def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozense
         try:
             return jax.eval_shape(functools.partial(run, quantities), of), quantities
         except NotPlannedError as missing:
-            if missing.quantity in quantities:
+            if missing.asked in quantities:
                 raise
-            quantities |= {missing.quantity}
+            quantities |= {missing.asked}
+
+
+def _sorted_out(quantities: Set[str]) -> tuple[frozenset[str], frozenset[str]]:
+    """Conditions that were asked for at their values, and those asked for as smooth ones."""
+    smooth = frozenset(name for name in quantities if name.startswith(SMOOTH))
+    return frozenset(quantities) - smooth, frozenset(name.removeprefix(SMOOTH) for name in smooth)
 
 
 def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
@@ -118,7 +129,8 @@ def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
         before = {id(element) for element in _behind_polariser(bare)}
         return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
 
-    return frozenset().union(*map(_conditions_asked, jax.eval_shape(changed, bare, effect)))
+    asked = frozenset().union(*map(_conditions_asked, jax.eval_shape(changed, bare, effect)))
+    return frozenset().union(*_sorted_out(asked))
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model.compiled import array
 from walop_jax.model.fold import State
 from walop_jax.model.light_path import LightPath
-from walop_jax.model.ray import Conditions
+from walop_jax.model.ray import SMOOTH, Conditions
 from walop_jax.model.sources import ExposureArrays
 
 
@@ -84,7 +84,8 @@ def with_numbers(
     plan: Plan, teff: Float[Array, ""], temperature: Float[Array, ""], hour_angle: Float[Array, ""]
 ) -> Plan:
     """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
-    conditions = {"temperature": temperature, "hour_angle": hour_angle}
+    numbers = {"temperature": temperature, "hour_angle": hour_angle}
+    conditions = numbers | {SMOOTH + name: value for name, value in numbers.items()}
     planned = {
         name: jnp.broadcast_to(conditions[name], plan.wavelength.shape) if name in conditions else value
         for name, value in plan.conditions.planned.items()

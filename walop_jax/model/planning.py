@@ -22,9 +22,12 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures
 from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
-from walop_jax.model.ray import CONDITIONS, Conditions
+from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions
 from walop_jax.model.sources import ExposureArrays
 
+SMOOTH_NODES = 8
+"""Values of a condition at which the optics are solved where they depend on it smoothly: exact for a polynomial of
+seventh degree, and to 2(a/2)⁸/8! for a phase that changes by ±a rad, 10⁻¹⁰ for a = 0.4."""
 SAMPLES = 9  # wavelengths of a band with a monotonic retardance between them
 ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the nodes allow
 
@@ -246,25 +249,42 @@ def _plan(
     """
     requirements, patched, count = needs(instrument), instrument.patched(), len(settings)
     moving = patched.moving()
-    names = sorted(requirements.conditions)
+    smooth = sorted(requirements.smooth)
+    names = sorted(requirements.conditions - requirements.smooth)
     values = {"temperature": settings.temperature, "hour_angle": settings.hour_angle, **of_list}
     assert set(values) == set(CONDITIONS)
     values |= {f"kind {kind}": (kinds == kind) * 1.0 for kind in instrument.kinds}
-    # A band is (positions, filter, conditions, colour temperature, slope, KIND); sorting puts equal positions together.
-    # NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so that a set with another
-    # colour for one of them has a plan of the same shape, and the same programs.
+    for name in names:
+        if name not in values:
+            _, start, _, stop = name.split()
+            values[name] = ((values["hours"] >= float(start)) & (values["hours"] < float(stop))) * 1.0
+    # A band is (positions, filter, conditions, smooth ones, colour temperature, slope, KIND); sorting puts equal
+    # positions together. NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so
+    # that a set with another colour for one of them has a plan of the same shape, and the same programs.
     # The angles of all elements, then their turns during the exposure.
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
     turns = [settings.turns.get(prefix, np.zeros(count)) for prefix in moving]
     states = _rows([*places, *turns], count)
     planned = _rows([values[name] for name in names], count)
+    followed = _rows([values[name] for name in smooth], count)
     teff = np.nan_to_num(settings.teff).tolist()
-    columns = (states, settings.filter.astype(str).tolist(), planned, teff, slope.tolist(), kinds.tolist())
-    keys = list(zip(*columns, strict=True))
+    of_filter = settings.filter.astype(str).tolist()
+    keys = list(zip(states, of_filter, planned, followed, teff, slope.tolist(), kinds.tolist(), strict=True))
     bands = sorted(set(keys))
 
-    groups = sorted({(name, moment) for _, name, moment, *_ in bands})
-    curves = {name: filters[name] for name, _ in groups}
+    moments: dict[Case, set[Moment]] = {}
+    for _, name, at, followed_at, *_ in bands:
+        moments.setdefault((name, at), set()).add(followed_at)
+    shares = {case: shares_of_points(of_case) for case, of_case in sorted(moments.items())}
+    groups = [
+        (*case, at) for case, of_case in shares.items() for at in sorted(set().union(*of_case.values()))
+    ]
+    number = {group: i for i, group in enumerate(groups)}
+    share = np.zeros((len(bands), len(groups)))
+    for row, (_, name, at, followed_at, *_) in zip(share, bands, strict=True):
+        for point, part in shares[name, at][followed_at].items():
+            row[number[name, at, point]] = part
+    curves = {name: filters[name] for name, *_ in groups}
     extrapolations(patched, curves.values())
     rules = {
         name: _rule(
@@ -279,9 +299,9 @@ def _plan(
     width = {
         n: float(np.trapezoid(c.throughput, c.wavelength) / c.throughput.max()) for n, c in curves.items()
     }
-    nodes, weights = (np.concatenate([rules[name][i] for name, _ in groups]) for i in (0, 1))
-    group = np.repeat(np.arange(len(groups)), [len(rules[name][0]) for name, _ in groups])
-    of_band = np.array([groups.index((name, moment)) for _, name, moment, *_ in bands])
+    nodes, weights = (np.concatenate([rules[name][i] for name, *_ in groups]) for i in (0, 1))
+    group = np.repeat(np.arange(len(groups)), [len(rules[name][0]) for name, *_ in groups])
+    conditions = [*names, *(SMOOTH + name for name in smooth)]
 
     def per_node(of_group: list[float]) -> Float[Array, " n"]:
         return array(np.asarray(of_group, float)[group])
@@ -295,19 +315,58 @@ def _plan(
     plan = Plan(
         wavelength=array(nodes),
         conditions=Conditions(
-            band_width=per_node([width[name] for name, _ in groups]),
-            planned={name: per_node([moment[i] for _, moment in groups]) for i, name in enumerate(names)},
+            band_width=per_node([width[name] for name, *_ in groups]),
+            planned={
+                name: per_node([(*at, *point)[i] for _, at, point in groups])
+                for i, name in enumerate(conditions)
+            },
         ),
-        node_weight=array(np.where(of_band[:, None] == group, weights, 0.0)),
-        teff=array([key[3] for key in bands], float),
+        node_weight=array(share[:, group] * weights),
+        teff=array([key[4] for key in bands], float),
         exposures=exposures,
         band_of=np.zeros((0, 1), int),
         settings=tuple(laid),
         moving=moving,
-        slope=array([key[4] for key in bands], float) if slope.any() else None,
+        slope=array([key[5] for key in bands], float) if slope.any() else None,
     )
     index = {key: i for i, key in enumerate(bands)}
     return plan, np.array([index[key] for key in keys], int)
+
+
+Moment = tuple[float, ...]
+"""Values of some conditions."""
+Case = tuple[str, Moment]
+"""A filter, and values of the conditions that are followed one by one."""
+
+
+def shares_of_points(moments: Collection[Moment]) -> dict[Moment, dict[Moment, float]]:
+    """Points at which the optics are solved for some moments, and the share of each point in each moment.
+
+    Lagrange's interpolation on a grid with `SMOOTH_NODES` of Chebyshev's points along a condition of more values; the
+    moments themselves where a grid has no fewer points. Source: Trefethen 2013, Approximation Theory, chs. 5, 8.
+    """
+    at = np.array(sorted(moments))
+    axes = [_points_along(values) for values in at.T]
+    if not np.isfinite(at).all() or np.prod([len(axis) for axis in axes]) >= len(at):
+        return {moment: {moment: 1.0} for moment in moments}
+    share = np.ones((len(at), 1))
+    for axis, values in zip(axes, at.T, strict=True):
+        away = (values[:, None] - axis)[:, None, :] / (axis[:, None] - axis + np.eye(len(axis)))
+        lagrange = np.where(np.eye(len(axis), dtype=bool), 1.0, away).prod(axis=2)
+        share = (share[:, :, None] * lagrange[:, None, :]).reshape(len(at), -1)
+    grid = list(itertools.product(*(axis.tolist() for axis in axes)))
+    return {
+        tuple(moment): dict(zip(grid, row, strict=True))
+        for moment, row in zip(at.tolist(), share.tolist(), strict=True)
+    }
+
+
+def _points_along(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
+    points = np.unique(values)
+    if len(points) <= SMOOTH_NODES:
+        return points
+    low, high = points[0], points[-1]
+    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(np.pi * np.linspace(0.0, 1.0, SMOOTH_NODES))
 
 
 def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:

@@ -16,17 +16,20 @@ Real = Float[Array, "..."]
 
 CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD", "exptime": "EXPTIME"}
 """Conditions on which the optics may depend from exposure to exposure (Celsius; hours; hours since the first one; s),
-and their columns of EXPOSURES. Whether an exposure is of some KIND is one more, for each KIND."""
+and their columns of EXPOSURES. Whether an exposure is of some KIND is one more, for each KIND, as is whether it is of
+some interval of hours."""
+SMOOTH = "smooth "
+"""Opens the name of a condition of which the optics are needed at a few values only (`planning.SMOOTH_NODES`)."""
 
 
 class NotPlannedError(ValueError):
-    """The optics depend on a quantity that the plan lacks; `quantity` is its name."""
+    """The optics depend on a quantity that the plan lacks: `quantity`, `asked` for as a smooth one or not."""
 
     def __init__(self, quantity: str) -> None:
-        self.quantity = quantity
+        self.asked, self.quantity = quantity, quantity.removeprefix(SMOOTH)
         super().__init__(
-            f"the optics ask for {quantity!r}, which this plan does not hold; make the plan with `plan_for` for the "
-            "instrument that is computed, effects included"
+            f"the optics ask for {self.quantity!r}, which this plan does not hold; make the plan with `plan_for` for "
+            "the instrument that is computed, effects included"
         )
 
 
@@ -43,6 +46,18 @@ class Conditions(eqx.Module):
         if name not in CONDITIONS:
             raise AttributeError(name)
         return self._planned(name)
+
+    def smooth(self, name: str) -> Real:
+        """One of `CONDITIONS` on which the optics depend as a polynomial does, to all digits that count."""
+        return self.planned[name] if name in self.planned else self._planned(SMOOTH + name)
+
+    def holds(self, name: str) -> bool:
+        """True if one of `CONDITIONS` is there, at its values or at a few."""
+        return name in self.planned or SMOOTH + name in self.planned
+
+    def between(self, start: str, stop: str) -> Real:
+        """1 in exposures of an interval of hours, 0 in others."""
+        return self._planned(f"hours {start} to {stop}")
 
     def of_kind(self, name: str) -> Real:
         """1 in exposures of a KIND, 0 in others."""

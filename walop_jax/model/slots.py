@@ -230,7 +230,7 @@ def _summed(
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
     conditions = plan.conditions
-    if "temperature" not in conditions.planned:  # the thermal change of one kelvin
+    if not conditions.holds("temperature"):  # the thermal change of one kelvin
         warm = jnp.full_like(plan.wavelength, REFERENCE_TEMPERATURE + 1.0)
         conditions = Conditions(conditions.band_width, {**conditions.planned, "temperature": warm})
 

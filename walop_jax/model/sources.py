@@ -76,6 +76,10 @@ class ExposureArrays(eqx.Module):
             raise NotPlannedError("median")
         return self.median_counts
 
+    def between(self, start: str, stop: str) -> Bool[Array | np.ndarray, " e"]:
+        """True in exposures of an interval of hours after the first one."""
+        return (self.hours >= float(start)) & (self.hours < float(stop))
+
     def of_kind(self, name: str) -> Bool[Array | np.ndarray, " e"]:
         """True in exposures of a KIND."""
         return self.kind == (self.kinds.index(name) if name in self.kinds else -1)

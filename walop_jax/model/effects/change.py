@@ -43,6 +43,7 @@ OPPOSITE = "opposite"  # the field point, as an origin of light
 SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order", "night hours")
 OF_LIST = ("exposure", "kind", "side", *SINGLE)  # forms of factors that ask for the list of exposures
 OF_RAY = ("kind", "per EXPTIME")  # those that the optics follow (`ray.Conditions`)
+GROWING = ("hours", "hour_angle", "temperature")  # conditions that factors are proportional to
 SKY, BAND = "sky", "band"  # places other than elements
 
 
@@ -324,8 +325,9 @@ class _InTrain:
     axis: Any
 
     def __getattr__(self, name: str) -> Any:
-        source = self.ray if name in ("x", "y", "wavelength") else self.ray.conditions
-        return getattr(source, name)
+        if name in GROWING:
+            return self.ray.conditions.smooth(name)
+        return getattr(self.ray if name in ("x", "y", "wavelength") else self.ray.conditions, name)
 
     def angle(self, prefix: str) -> Any:
         """Angle of the element itself, the only one in the optics (`Grows`)."""

@@ -6,8 +6,9 @@ reads the texts.
 
 The argument of a value has x, y (deg), wavelength (µm), hours since the first exposure, hour_angle
 (h), temperature (Celsius), exposure time (s), the number of the exposure in its list, `of_kind(name)`, true for
-exposures of a KIND, and `angle(prefix)` (rad) of the polariser or another moving element, NaN where that is out of the
-beam; all are scalars, or arrays that broadcast. The second argument holds the scales of field and wavelength.
+exposures of a KIND, `between(start, stop)`, true for those of an interval of hours, and `angle(prefix)` (rad) of the
+polariser or another moving element, NaN where that is out of the beam; all are scalars, or arrays that broadcast. The
+second argument holds the scales of field and wavelength.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ FORMS: Mapping[str, tuple[str, str, str, str, Callable[..., Any]]] = {
     ),
     "hours A to B": (
         rf"hours {NUMBER} to {NUMBER}", EXPOSURE, "from {0} to {1} h after the first exposure", ONCE_MORE,
-        lambda at, _, start, stop: ((at.hours >= float(start)) & (at.hours < float(stop))) * 1.0,
+        lambda at, _, start, stop: at.between(start, stop) * 1.0,
     ),
     "exposure N": (
         r"exposure (\d+)", EXPOSURE, "in exposure {0} of the list (the first is 0)", ONCE_MORE,

@@ -156,7 +156,7 @@ class WavePlate(Element):
                 extraordinary = ordinary + (extraordinary - ordinary) * factor
             thermal = _number(self, "thermal", ray)
             if thermal is not None:
-                warmer = thermal * (ray.conditions.temperature - REFERENCE_TEMPERATURE)
+                warmer = thermal * (ray.conditions.smooth("temperature") - REFERENCE_TEMPERATURE)
                 extraordinary = ordinary + (extraordinary - ordinary) * (1.0 - crystal.thermal * warmer)
             axis = jnp.deg2rad(_number(self, "axis", ray) + _number(layer, "axis", ray))
             cut = _number(layer, "cut", ray)
