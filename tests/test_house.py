@@ -198,7 +198,7 @@ MOST_LINES = {
     "instruments": 220,
     "data": 5592,
     "sky": 436,
-    "model": 9507,
+    "model": 9601,
     "likelihood": 3310,
     "simulation": 1089,
     "fit": 2102,
