@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 import walop_jax as walop
-from walop_jax.data.header_words import exposures_table, read_words, words_of
+from walop_jax.data.header_words import exposures_table, of_header, read_words, words_of
 from walop_jax.data.records import Site
 from walop_jax.io.errors import DataError
 
@@ -191,6 +191,21 @@ def test_files_of_words_that_cannot_be_meant_are_told(words: Path, tmp_path: Pat
     words.write_text(WORDS.replace(old, new, 1))
     with pytest.raises(DataError, match=message):
         exposures_table(headers(tmp_path), read_words(words))
+
+
+def test_an_expression_takes_other_columns_as_they_are_in_the_end(words: Path, tmp_path: Path):
+    """The middle of 30000 ms that begin at 18:00 UTC of a word that is 8 h ahead, by way of two other expressions."""
+    text = WORDS.replace('word = "EXPMIN"\nunit = "min"', 'word = "EXPMS"\nexpression = "x / 1000"')
+    text += '[HA]\nword = "ZONE"\nexpression = "x / EXPTIME * 30"\n'
+    text = text.replace("x + EXPTIME / 2 / 86400", "x + EXPTIME / 2 / 86400 - HA / 24")
+    first, _ = headers(tmp_path, EXPMS=30000.0, ZONE=8.0, **{"DATE-OBS": "2026-11-27T02:00:00"})
+    columns, _ = exposures_table([first], words_of(tomllib.loads(text)))
+    np.testing.assert_allclose(columns["MJD"], 61370.75 + 15 / 86400, atol=1e-9)
+    assert (columns["EXPTIME"], columns["HA"]) == (30.0, 8.0)
+    one = of_header(fits.getheader(first), words_of(tomllib.loads(text)), ("MJD",), first)
+    assert one == {"MJD": columns["MJD"][0]}
+    with pytest.raises(DataError, match="MJD: the expressions of MJD and EXPTIME and HA need each other"):
+        exposures_table([first], words_of(tomllib.loads(text.replace("x / 1000", "x / 1000 + HA"))))
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,8 @@ class Word:
     """Origin of a column: the first of the words in `word` that is there, or a fixed `value`.
 
     `values` replace those of the word (names of filters, kinds, positions), `unit` is that of the word, `expression`
-    makes the value of the column of x, the value in the unit of the column, and of other columns by name.
+    makes the value of the column of x, the value in the unit of the column, and of other columns, as they are in the
+    end, by name.
     """
 
     word: tuple[str, ...] = ()
@@ -168,11 +169,14 @@ def of_header(
     header: Mapping[str, Any], words: Words, names: Collection[str], file: PathLike
 ) -> dict[str, Any]:
     """The columns `names` that `words` make of one header, those that have a word."""
-    stated = {name: word for name, word in words.columns.items() if name in names}
-    operands = set().union(*(_names(w.expression, Reader(""), "") for w in stated.values() if w.expression))
-    needed = {name: word for name, word in words.columns.items() if name in {*stated, *operands}}
+    needed, waiting = dict[str, Word](), list(names)
+    while waiting:  # with what their expressions need, and what that needs
+        name = waiting.pop()
+        if name in words.columns and name not in needed:
+            word = needed[name] = words.columns[name]
+            waiting += _operands(word.expression)
     row = _row(_plain(header), needed, str(file))
-    return {name: value for name, value in row.items() if name in stated}
+    return {name: value for name, value in row.items() if name in names}
 
 
 def _plain(header: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,10 +266,16 @@ def _row(record: Mapping[str, Any], words: Mapping[str, Word], file: str) -> dic
             what = f"the word {listed} is {'empty' if empty else 'missing'}"
             raise place.fail(what, name, f"{like}optional = true where it may be absent")
         converted[name] = _value(value, name, rules[name], word, place)
-    stated = {name: word.expression for name, word in words.items() if word.expression and name in converted}
-    operands = ({**converted, "x": converted[name]} for name in stated)
-    made = zip(stated, stated.values(), operands, strict=True)
-    return converted | {name: _evaluated(text, values, name, place) for name, text, values in made}
+    waiting = {name: word.expression for name, word in words.items() if word.expression and name in converted}
+    while waiting:  # first those whose operands are as they will be
+        ready = [name for name, text in waiting.items() if not (_operands(text) - {name}) & set(waiting)]
+        if not ready:
+            what = f"the expressions of {' and '.join(waiting)} need each other"
+            raise place.fail(what, next(iter(waiting)), "give one of them without the other")
+        for name in ready:
+            operands = {**converted, "x": converted[name]}
+            converted[name] = _evaluated(waiting.pop(name), operands, name, place)
+    return converted
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:
@@ -341,6 +351,11 @@ def _names(expression: str, read: Reader, name: str) -> set[str]:
                 name, f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
             )
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+
+
+def _operands(expression: str) -> set[str]:
+    """Names in an expression that has been checked."""
+    return _names(expression, Reader(""), "") if expression else set()
 
 
 def _evaluated(expression: str, values: Mapping[str, Any], name: str, place: Place) -> float:
