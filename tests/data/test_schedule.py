@@ -160,6 +160,16 @@ def test_a_turning_plate_a_change_of_filter_and_windows(tmp_path: Path):
     assert 3600 * int(hours) + 60 * int(minutes) + int(rest) == pytest.approx(seconds, abs=1.0)
 
 
+@pytest.mark.parametrize("longitude", [-70.4, 289.6])
+def test_the_night_is_that_of_the_site_however_its_longitude_is_counted(longitude):
+    """Exposures from 01:37 UTC of New Year's Day on: in Chile, UTC − 5 h, it is still the evening before."""
+    plan = dataclasses.replace(PLAN, mjd=Time("2026-01-01T03:00:00").mjd)
+    site = dataclasses.replace(PLAN.site, latitude=-24.6, longitude=longitude)
+    schedule, _ = schedule_of(plan.exposures(), site, FILTERS)
+    assert schedule["date"] == "2025-12-31"
+    assert schedule["targets"][1]["acquisition"][0]["window"]["start"] == "21:29:30"
+
+
 def test_an_executed_schedule_has_times(tmp_path: Path):
     exposures = PLAN.exposures()
     schedule = written(tmp_path / "s.json", exposures)

@@ -179,7 +179,8 @@ def _type(one: Exposures) -> str:
 
 def _local(mjd: float, site: Site) -> datetime.datetime:
     """Local mean time, in whole hours from UTC."""
-    hours = round(site.longitude / 15.0) if math.isfinite(site.longitude) else 0
+    west = site.longitude > 180.0  # 290 deg east is 70 deg west: five hours behind UTC, not nineteen ahead
+    hours = round((site.longitude - 360.0 * west) / 15.0) if math.isfinite(site.longitude) else 0
     return datetime.datetime(1858, 11, 17) + datetime.timedelta(days=mjd, hours=hours)
 
 
