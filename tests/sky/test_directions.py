@@ -79,6 +79,10 @@ def test_names_are_cut_off_not_rounded():
     assert designations(
         np.array([97.79416016514, 359.9999999, 0.0]), np.array([-44.18037606, 0.99999, -0.5])
     ).tolist() == ["J063110.59-441049.3", "J235959.99+005959.9", "J000000.00-003000.0"]
+    # Less than rounding from 0 h: there is no hour 24.
+    assert designations(np.array([-1e-14, 360.0 - 1e-11]), np.zeros(2)).tolist() == 2 * [
+        "J000000.00+000000.0"
+    ]
 
 
 def test_a_shift_and_a_rotation_are_recovered():

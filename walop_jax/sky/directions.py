@@ -87,7 +87,7 @@ def galactic(ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees, Degrees]:
 
 def designations(ra: Degrees, dec: Degrees) -> np.ndarray:
     """Names of directions (deg) by their coordinates, Jhhmmss.ss+ddmmss.s, cut off as the IAU asks."""
-    seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int)  # hundredths
+    seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int) % 8640000  # hundredths
     arcsec = np.floor(np.abs(dec) * 36000.0 + 1e-6).astype(int)  # tenths
     sign = np.where(np.asarray(dec) < 0, "-", "+")
     return np.array(
