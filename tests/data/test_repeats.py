@@ -89,6 +89,19 @@ def test_copies_of_exposures_are_remarked_on_by_number(tmp_path, name, chosen):
     assert "have the counts of others at the same places; remove them" in remark
 
 
+def test_a_copy_with_a_row_that_is_not_finite_is_a_copy(tmp_path):
+    """Its other rows would count twice, as measurements of their own at the same time."""
+    table, path = plain().intensities, tmp_path / "twice.fits"
+    assert isinstance(table, TableIntensities)
+    spoilt = table.counts.copy()
+    spoilt[np.flatnonzero(table.exposure == 4)[2], 1] = np.nan
+    calset = dataclasses.replace(plain(), intensities=dataclasses.replace(table, counts=spoilt))
+    write_calibration_set(path, again(calset, slice(4, 5)))
+    read = read_calibration_set(path)
+    assert any("are the same to the last bit, the second is not used" in text for text in read.remarks)
+    assert read.intensities.rows == table.rows - 1
+
+
 @pytest.mark.parametrize("change", [np.asarray, np.float32], ids=["same", "float32"])
 def test_points_under_new_numbers_are_remarked_on(change):
     table = plain().intensities

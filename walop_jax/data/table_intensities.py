@@ -287,7 +287,8 @@ def mask_repeats(
         for repeat in repeats:
             ids = f"exposures {exposures.exposure[first]} and {exposures.exposure[repeat]}"
             again = rows_of(repeat)
-            if len(rows) and all(np.array_equal(v[rows], v[again]) for v in (point, intensities.counts)):
+            pairs = ((values[rows], values[again]) for values in (point, intensities.counts))
+            if len(rows) and all(np.array_equal(*pair, equal_nan=True) for pair in pairs):
                 remarks.append(f"{ids} are the same to the last bit, the second is not used")
                 used[again] = False
             elif fine and np.isin(point[rows[used[rows]]], point[again[used[again]]]).any():
