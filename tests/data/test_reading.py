@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
-from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.calset import from_arrays, read_calibration_set
 from walop_jax.data.inspection import inspect
+from walop_jax.data.records import DataFlag
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.errors import DataError
 
@@ -162,6 +164,19 @@ def test_truth_values_of_flags_are_bad_pixels(handmade):
     assert calset.intensities.flag.tolist() == [2 * int(flag) for flag in flags]
     assert "FLAG: holds truth values: true is taken as 2, bad pixel" in "; ".join(calset.remarks)
     assert inspect(calset).flags == {"bad pixel": 1}
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.02, False), (0.08, True)])
+def test_the_share_of_saturated_rows_is_that_of_all_rows(share, doubted):
+    """Of 4096 field points a quarter is looked at, flags are counted at all."""
+    rng = np.random.default_rng(0)
+    counts = 1e5 * (1.0 + rng.random((4096, 4, 4)))
+    x, y = rng.uniform(-0.25, 0.25, (2, 4096))
+    calset = from_arrays(counts, np.sqrt(counts), x, y, np.arange(4) * 45.0)
+    table = TableIntensities.of(calset.intensities, calset.points)
+    table = table.flagged(np.arange(len(table.flag)) < share * len(table.flag), DataFlag.SATURATED)
+    found = inspect(dataclasses.replace(calset, intensities=table)).findings
+    assert any("rows are saturated" in finding.what for finding in found) == doubted
 
 
 def test_plates_out_of_the_beam_have_no_angle(handmade):

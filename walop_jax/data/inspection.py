@@ -224,7 +224,8 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
         what = f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)"
         yield Finding("doubt", what, "are N and N_ERR in electrons, or in counts (multiply by the gain)?")
     yield from about_exposures(calset.exposures)
-    if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * made.possible:
+    everywhere = made.points * len(calset.exposures)  # flags are those of all points, not of those looked at
+    if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * everywhere:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
     if unknown := made.flags.get("other", 0):
         yield Finding("note", f"{unknown} rows have FLAG bits without a meaning", "they are not used")
