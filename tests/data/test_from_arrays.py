@@ -75,6 +75,16 @@ def test_arrays_come_back():
     assert set(made().exposures.kind) == {"clp"}
 
 
+def test_the_level_of_the_sky_comes_back():
+    """A diagnosis asks for a share of it that is left in the counts."""
+    counts, level = light(), 100.0 * np.arange(1.0, 97.0).reshape(3, 8, 4)
+    counts[1, 2] = np.nan
+    again = from_arrays(**made(counts=counts, sky=level).to_arrays()).intensities
+    assert isinstance(again, TableIntensities)
+    np.testing.assert_array_equal(again.sky, level[again.point, again.exposure])
+    assert made().to_arrays()["sky"] is None
+
+
 def test_units_are_converted():
     calset = made(x=X * 60 * units.arcmin, angles=np.deg2rad(ANGLES) * units.rad, temp=283.15 * units.K)
     np.testing.assert_allclose(calset.points.x, X, rtol=1e-14)

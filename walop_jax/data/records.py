@@ -7,7 +7,7 @@ import enum
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -368,7 +368,10 @@ class CalibrationSet(Displayed):
         True
         """
         block, e = self.intensities.block(0, len(self.points)), self.exposures
-        used = block.used[:, :, None]
+        used, level, table = block.used[:, :, None], None, cast("Any", self.intensities)
+        if getattr(table, "sky", None) is not None:  # of a table with the column SKY
+            level = np.zeros(block.counts.shape)
+            level[table.point, table.exposure] = table.sky
         others = ("EXPOSURE", "KIND", "CLP_IN", "CLP_ANGLE")
         columns = {name.lower(): values for name, values in e.columns().items() if name not in others}
         stars = {f.name.upper(): getattr(self.sources, f.name) for f in dataclasses.fields(Sources)}
@@ -379,6 +382,7 @@ class CalibrationSet(Displayed):
             "y": block.y,
             "angles": np.where(e.clp_in, e.clp_angle, np.nan),
             "kinds": e.kind,
+            "sky": level,
             "source": np.where(block.source >= 0, np.append(self.sources.source, -1)[block.source], -1),
             **columns,
             "instrument": self.instrument,
