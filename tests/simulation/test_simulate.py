@@ -413,6 +413,12 @@ def test_without_a_polariser_there_are_no_exposures_through_one(tmp_path):
         dataclasses.replace(plan, lamps=0)
 
 
+def test_every_standard_has_a_name_of_its_own():
+    sources, _ = true_instrument(ObservingPlan(grid=2, moon_patches=0, standards=102))
+    assert sources.name[[0, 10, 101]].tolist() == ["STD00", "STD10", "STD101"]
+    assert len(np.unique(sources.name)) == 102
+
+
 @pytest.mark.parametrize(
     ("unpolarised", "lmax"), [(3, [0.55, 0.55, 0.55]), (1, [0.55, 0.45, 0.65])], ids=["all", "one"]
 )

@@ -117,7 +117,7 @@ def _catalogue(plan: ObservingPlan, rng: np.random.Generator) -> tuple[Sources, 
     names = plan.star_names
     sources = Sources(
         source=np.arange(len(names)),
-        name=np.array(names, dtype="U5"),
+        name=np.array(names, dtype="U"),
         q=catalogue[0],
         u=catalogue[1],
         q_err=error,
