@@ -203,7 +203,7 @@ MOST_LINES = {
     "simulation": 1089,
     "fit": 2102,
     "calibration": 2661,
-    "posterior": 2180,
+    "posterior": 2182,
     "science": 5822,
     "diagnosis": 7943,
     "nights": 2598,

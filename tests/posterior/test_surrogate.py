@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
 from walop_jax.posterior.target import Target, choose_sampled, near_linear
@@ -53,6 +54,33 @@ def test_inflation_is_the_plain_posterior_at_f_1_and_the_integral_elsewhere(gaus
         )
         values.append(-0.5 * (chi2 + log_determinant + log**2) - 1000 * log)
     np.testing.assert_allclose(inflated.density().log_density(coordinates), values, rtol=1e-10)
+
+
+@pytest.mark.parametrize("inflate", [False, True])
+def test_the_density_that_is_compared_is_that_of_the_draws(gaussian: Surrogate, inflate: bool) -> None:
+    """The density of sampled coordinates times the normal distribution of the others, by scipy, up to a constant."""
+    rng, weak = np.random.default_rng(5), np.zeros_like(gaussian.data)
+    weak[5:15, -3:] = 0.1 * rng.standard_normal((10, 3))
+    skewed = dataclasses.replace(
+        gaussian, data=gaussian.data + weak + weak.T, inflate=inflate, slope=0.2 * rng.standard_normal(4),
+        skew=rng.standard_normal(3),
+    )  # fmt: skip
+    z = rng.standard_normal((30, 4 + inflate))
+    x = skewed.draw(z, rng)
+    f = np.exp(skewed.ln_f_unit * z[:, 4:]) if inflate else np.ones((30, 1))
+    expected = []
+    for at, place, factor in zip(z[:, :4], x, f[:, 0], strict=True):
+        h = skewed.features(at[None])[0]
+        q = skewed.data / factor**2 + skewed.prior
+        own = np.linalg.inv(q[-3:, -3:])
+        mean = -own @ (q[-3:, :15] @ h + 0.5 * skewed.skew)
+        expected.append(multivariate_normal(mean, own).logpdf(place[4:]))
+    ln_f = np.log(f[:, 0])
+    own_of_f = (
+        -0.5 * ln_f**2 - 1000 * ln_f
+    )  # the prior of ln f and its share of the likelihood, which cancel there
+    total = skewed.density().log_density(z) + np.array(expected) - own_of_f
+    np.testing.assert_allclose(np.diff(-0.5 * skewed.joint(z, x)), np.diff(total), atol=1e-9)
 
 
 def test_physics_is_sampled_and_series_and_catalogue_are_not(scene: Scene) -> None:

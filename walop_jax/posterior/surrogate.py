@@ -166,8 +166,10 @@ class Surrogate:
         offset = x - self.centre - z[:, :k] @ self.along.T
         s = np.linalg.lstsq(self.across, offset.T, rcond=None)[0].T if len(self.share) else offset[:, :0]
         y = np.concatenate([self.features(z[:, :k]), s], axis=1)
-        weight = self.weight(z)
-        tilt = z[:, :k] @ self.slope + s @ self.skew
+        weight, skew = self.weight(z), self.skew @ self.linear
+        mean, variance = self._conditional(z)
+        # Of s only the way from its conditional mean is in it, as it is drawn: what is left of the square is taken off.
+        tilt = z[:, :k] @ self.slope + s @ self.skew - (mean + 0.25 * variance * skew) @ skew
         return weight * np.sum((y @ self.data) * y, axis=1) + np.sum((y @ self.prior) * y, axis=1) + tilt
 
 
