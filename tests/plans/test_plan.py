@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
+from own_instrument import OWN
 from small_run import small_fit
 
 import walop_jax as walop
@@ -22,11 +25,12 @@ from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
 from walop_jax.likelihood.flux import Sharing
 from walop_jax.likelihood.likelihood import prior_rows
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.plans.available import Available, Costs
+from walop_jax.plans.available import Available, Costs, with_stops
 from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
-from walop_jax.plans.exposures import Illumination, candidates, information_of
-from walop_jax.plans.plan import plan_from
+from walop_jax.plans.exposures import Illumination, candidates, fewer_points, information_of
+from walop_jax.plans.plan import Line, _changes, plan_from
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
 from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
@@ -63,7 +67,6 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     places = np.deg2rad(2 * np.array(angles))[:, None]
     total = small.prior + families[0].information(places)[0].sum(axis=0)
     total += families[1].basis[0, [0, 2]].sum(axis=0)
-    # The raster of the candidates has at most 3 × 3 places, that of this plan 2 × 2: nothing is scaled.
     total += families[2].basis[0, [1, 1, 0]].sum(axis=0)
     promised = field.error(np.linalg.pinv(total, rcond=1e-14, hermitian=True)[None])[0]
     matrix, covariance = calibration.matrix(field.x, field.y)
@@ -71,6 +74,41 @@ def test_the_promise_is_the_error_of_a_fit(small, field):
     seen = np.isfinite(promised)
     assert 0.5 < seen.mean() < 1.0
     np.testing.assert_allclose(promised[seen], found[seen], rtol=0.02)
+
+
+STARS = ObservingPlan(
+    grid=2, standard_grid=4, moon_patches=0, standards=1, unpolarised=0, zero_stars=6, zero_scatter=0.05,
+    throughput_degree=0,
+)  # fmt: skip
+
+
+def test_a_standard_has_all_places_of_its_raster_and_stars_of_a_field_scatter():
+    """By hand: a factor on a camera, its flux eliminated, from the counts of 16 places; q of six stars that scatter."""
+    found = candidates(Available(STARS), draws=1, angles=31)
+    plan = dataclasses.replace(STARS, stops=(Stop(0.0), Stop(None, kind="standard")))
+    truth = found.model.instrument(found.values[0])
+    block = simulate(plan, instrument=truth, noiseless=True, steady=True).calset.intensities.block(0, 99)
+    counts, sigma = (values[block.used[:, 1], 1] for values in (block.counts, block.sigma))
+    assert len(counts) == 16
+    weight = (counts / sigma) ** 2
+    information = np.sum(weight[:, 1] - weight[:, 1] ** 2 / weight.sum(axis=1))
+    name = "throughput.n1.p00"
+    i, value = found.names.index(name), found.values[0, found.model.index(name)]
+    standards = found.families[-1].basis[0]
+    assert standards[0, i, i] == pytest.approx(information / value**2, rel=1e-3)
+    # Photon noise is nothing beside their scatter: six numbers make a mean. Not all of them show u.
+    of_field = [found.names.index(f"standard.ZERO.{axis}") for axis in "qu"]
+    known = np.linalg.eigvalsh(standards[1][np.ix_(of_field, of_field)])
+    assert known[-1] == pytest.approx(6 / 0.05**2, rel=1e-2)
+
+
+def test_fewer_points_are_those_of_the_grid():
+    """Every place of a raster is there to be chosen."""
+    few, factor = fewer_points(ObservingPlan())
+    assert (few.grid, few.standard_grid, factor) == (6, 5, 4.0)
+    choices, _ = Available(ObservingPlan(), places=True).choices()
+    (standards,) = (choice for choice in choices if choice.kind == "standard")
+    assert with_stops(few, standards.stops).layout()[0].sum() == 8 * 25
 
 
 def test_what_a_calibration_knows_holds_its_priors_once():
@@ -238,6 +276,34 @@ def test_changes_take_time_from_the_plan(small, field):
     assert second.seconds <= 15 * 60
     assert second.bound == pytest.approx(first.bound, rel=1e-6)
     assert second.value >= first.bound
+
+
+def test_standards_are_as_far_apart_as_they_are_on_the_sky(small):
+    """A second for each degree, by astropy; a star that is observed again stands where it stood."""
+    plan = dataclasses.replace(SMALL, moon_patches=0, standards=4)
+    found = dataclasses.replace(small, available=Available(plan), choices=Available(plan).choices()[0])
+    stars, standard = (0, 2, 2, 3, 1), next(i for i, c in enumerate(found.choices) if c.kind == "standard")
+    changes = list(_changes(found, [Line(0, (0.0,), 3), *(Line(standard, (float(k),), 2) for k in stars)]))
+    each = tuple(Stop(None, kind="standard", number=k) for k in range(4))
+    e = dataclasses.replace(plan, stops=each, stars=()).exposures()
+    where = SkyCoord(e.ra, e.dec, unit="deg")[list(stars)]
+    apart = where[:-1].separation(where[1:]).deg
+    np.testing.assert_allclose(changes, [0.0, 0.0, *apart], atol=1e-9)
+    assert min(apart[[0, 2, 3]]) > 10.0
+
+
+def test_without_a_polariser_no_exposure_goes_through_one(tmp_path):
+    text = OWN.replace('path = ["polariser", "window"]', 'path = ["window"]')
+    (tmp_path / "own.toml").write_text(re.sub(r"\[elements\.polariser\]\n(?:.+\n){3}", "", text))
+    plan = ObservingPlan(
+        Instrument.read(tmp_path / "own.toml"),
+        moon_patches=0,
+        standards=0,
+        lamps=1,
+        moving={"WIN": (0.0, 45.0)},
+    )
+    choices, _ = Available(plan).choices()
+    assert [choice.kind for choice in choices] == ["lamp", "lamp"]
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ more.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -185,6 +186,8 @@ class Available:
             where = dict(zip(positions, stops, strict=True))
             moving = {prefix: a for prefix, a in where.items() if prefix != CALIBRATION_PLATE}
             for kind in EXPOSED:
+                if kind == "clp" and plan.design.polariser is None:
+                    continue
                 for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
                     angle = 0.0 if kind == "clp" else None
                     blank = Stop(angle, name, stops[0], moving, kind=kind, seconds=seconds)
@@ -210,8 +213,7 @@ class Available:
         if not plan.site.known:
             advice = "the site is not known; give it in the description, under [site]"
             return (), [f"{what} are left out: {advice}"]
-        stops = [Stop(None, plan.filter_names[0], kind=kind, number=i) for i in range(total)]
-        e = with_stops(plan, stops).exposures()
+        e = self.targets[kind]
         visible, why = self._visible(e)
         if self.throughout and visible.any():
             # Standards are chosen when their time has come: only the Moon has a place.
@@ -222,6 +224,16 @@ class Available:
         lost = total - int(visible.sum())
         notes = [f"{lost} of {total} {what} are left out: {why}{self._better()}"] if lost else []
         return tuple(np.flatnonzero(visible).tolist()), notes
+
+    @functools.cached_property
+    def targets(self) -> Mapping[str, Exposures]:
+        """The Moon patches and the standards, by kind: an exposure of each in the order of their numbers."""
+        plan, name = self.plan, self.plan.filter_names[0]
+        totals = {"moon": plan.moon_patches, "standard": len(plan.star_names)}
+        stops = {
+            kind: [Stop(None, name, kind=kind, number=i) for i in range(n)] for kind, n in totals.items() if n
+        }
+        return {kind: with_stops(plan, each).exposures() for kind, each in stops.items()}
 
     def _visible(self, exposures: Exposures) -> tuple[Bool[np.ndarray, " e"], str]:
         """Exposures of the sky that are high enough, in the dark; and why others are not."""

@@ -52,7 +52,7 @@ ANGLES = 361
 So many since errors vary quickly where a camera is dark: over some √(σ²/N) rad, N its counts in full light."""
 ORDERS = (128, 64)
 """Degrees of that series in 2(2α − θ) and in 2α where the calibration plate may stand at any angle α."""
-GRID, STAR_GRID = 6, 3
+GRID = 6
 """Field points along each axis at which the information is computed, scaled to those of the plan."""
 DRAWS = 20
 _BETWEEN = 60  # places at which the series of a gain are held against the information itself
@@ -118,7 +118,8 @@ def candidates(
     choices, notes = available.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, turn = fewer_points(available.plan), 360.0 if effects else 180.0
+    few, factor = fewer_points(available.plan)
+    turn = 360.0 if effects else 180.0
     choices = tuple(choice._replace(turn=turn) for choice in choices)
     stops = [_nodes(choice, bool(effects)) for choice in choices]
     first = np.cumsum([0, *map(len, stops)])
@@ -133,8 +134,7 @@ def candidates(
         if p.part in stated:
             values[:, i] = p.start
     likelihood = Likelihood.of(calset, model)
-    factor, flux = _factor(available.plan, few), simulation.fluxes(plan, None)
-    exptime = plan.exposures().exptime
+    flux, exptime = simulation.fluxes(plan, None), plan.exposures().exptime
     noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
     shared = Sharing(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
@@ -148,7 +148,8 @@ def candidates(
         """The light of some exposures of a choice, and their counts in every draw."""
         at, star = likelihood.used[:, rows.start], choice.kind == "standard"
         electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-        scatter = plan.zero_scatter if star and choice.stops[0].number == plan.standards else 0.0
+        of_field = star and plan.stops[rows.start].number == plan.standards
+        scatter = plan.zero_scatter if of_field else 0.0
         scale, of_stars = 1.0 if star else factor, dict.fromkeys(means, scatter)
         lit = Illumination(electrons, noise, floor, shared, scale, of_stars)
         return lit, tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
@@ -199,17 +200,11 @@ def _with(
     return extended, stated
 
 
-def fewer_points(plan: ObservingPlan) -> ObservingPlan:
-    """The same over fewer field points, which are spread alike."""
-    star_grid = plan.standard_grid if any(s.place for s in plan.stops) else min(plan.standard_grid, STAR_GRID)
-    return dataclasses.replace(plan, grid=min(plan.grid, GRID), standard_grid=star_grid)
-
-
-def _factor(plan: ObservingPlan, few: ObservingPlan) -> float:
-    """Field points of a plan, beside those of stars, over those of another."""
-    of_stars = ((p.standard_grid**2 if p.standards else 0) + p.zero_stars for p in (plan, few))
-    many, fewer = (len(p.points()) - stars for p, stars in zip((plan, few), of_stars, strict=True))
-    return many / fewer
+def fewer_points(plan: ObservingPlan) -> tuple[ObservingPlan, float]:
+    """The same over fewer field points, spread alike, and by how many times fewer; standards keep all their places."""
+    few = dataclasses.replace(plan, grid=min(plan.grid, GRID))
+    stars = (plan.standard_grid**2 if plan.standards else 0) + plan.zero_stars
+    return few, (len(plan.points()) - stars) / (len(few.points()) - stars)
 
 
 def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Float[np.ndarray, "r n"]:

@@ -428,23 +428,21 @@ def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
 
     lines.sort(key=key)
     done, sky = ([line for line in lines if key(line)[0] == place] for place in (0, 1))
-    where = dict(zip(sky, _pointings(found, sky), strict=True))
+    last = None
     while sky:
         same = [line for line in sky if key(line) == key(sky[0])]
-        last = done[-1] if done and done[-1] in where else same[0]
-        after = min(same, key=lambda line: float(separation(*where[last], *where[line])))
-        done.append(after)
-        sky.remove(after)
+        begin = _pointing(found, last or same[0])
+        last = min(same, key=lambda line: float(separation(*begin, *_pointing(found, line))))
+        done.append(last)
+        sky.remove(last)
     return done
 
 
-def _pointings(found: Candidates, lines: list[Line]) -> list[tuple[float, float]]:
-    """Right ascension and declination (deg)."""
-    if not lines:
-        return []
-    stops = (found.choices[line.choice].stop(line.place) for line in lines)
-    exposures = with_stops(found.available.plan, stops).exposures()
-    return list(zip(exposures.ra.tolist(), exposures.dec.tolist(), strict=True))
+def _pointing(found: Candidates, line: Line) -> tuple[float, float]:
+    """Right ascension and declination (deg) of the Moon patch or standard of a line."""
+    choice = found.choices[line.choice]
+    targets, number = found.available.targets[choice.kind], choice.stop(line.place).number
+    return float(targets.ra[number]), float(targets.dec[number])
 
 
 def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
@@ -458,7 +456,7 @@ def _changes(found: Candidates, lines: list[Line]) -> Iterator[float]:
             time += costs.filter * (choice.filter != last.filter)
             time += costs.position * sum(choice.positions[p] != a for p, a in last.positions.items())
         if choice.kind in ("moon", "standard"):
-            (pointing,) = _pointings(found, [line])
+            pointing = _pointing(found, line)
             time += 0.0 if previous is None else costs.slew * float(separation(*previous, *pointing))
             previous = pointing
         last = choice
