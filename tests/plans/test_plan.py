@@ -29,11 +29,11 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.available import Available, Costs, with_stops
 from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
-from walop_jax.plans.exposures import Illumination, candidates, fewer_points, information_of
+from walop_jax.plans.exposures import Illumination, _with, candidates, fewer_points, information_of
 from walop_jax.plans.plan import Line, _changes, plan_from
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
-from walop_jax.simulation.simulate import PhotonNoise, effect_from_text, simulate
+from walop_jax.simulation.simulate import PhotonNoise, as_planned, effect_from_text, simulate
 
 ANGLES = 181
 SMALL = ObservingPlan(
@@ -386,6 +386,15 @@ def test_effects_to_tell_apart_need_the_size_of_one(small):
         criterion_by_name(
             dataclasses.replace(small, effects={"clp_zero": False, "hwp1_axis": False}), None, "apart"
         )
+
+
+@pytest.mark.parametrize(
+    ("effect", "column"), [("flexure=rate_x:0.003,rate_y:0.0", "HA"), ("hwp_temperature", "TEMP")]
+)
+def test_effects_of_conditions_that_no_plan_chooses_are_refused(small, effect, column):
+    """Where hour angles went with the angles of the polariser flexure was promised four times its distance."""
+    with pytest.raises(ValueError, match=f"grows with {column}, which no plan chooses; leave it out"):
+        _with(small.model, as_planned(SMALL), ("hwp2_axis", effect))
 
 
 @pytest.mark.long

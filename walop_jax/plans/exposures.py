@@ -34,7 +34,9 @@ from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
+from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
+from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.sources import MoonSky
 from walop_jax.model.specification import Model, effect_context, with_effects
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
@@ -55,6 +57,8 @@ ORDERS = (128, 64)
 GRID = 6
 """Field points along each axis at which the information is computed, scaled to those of the plan."""
 DRAWS = 20
+NOT_CHOSEN = {condition: column for condition, column in CONDITIONS.items() if condition != "exptime"}
+"""Conditions of an exposure that are as they come, and their columns."""
 _BETWEEN = 60  # places at which the series of a gain are held against the information itself
 Counts = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
 """Counts of light of unit flux, and their derivatives to the free parameters."""
@@ -112,7 +116,7 @@ def candidates(
     Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
     are those of the polariser. `effects` of the `catalogue` may be there as well, at their values; those given by
     name alone at the size of their scale. Raises ValueError where nothing is left to be observed, and for effects
-    that do not act on light.
+    that do not act on light, or grow with time, hour angle or temperature.
     """
     tell = progress or (lambda text: None)
     choices, notes = available.choices()
@@ -190,6 +194,11 @@ def _with(
         kind = effect_by_name(name, model.catalogue)
         if kind.is_structural():
             what = f"{name} is there or it is not, and has no size that could be planned for"
+            raise ValueError(f"{what}; leave it out")
+        # Angles at which light is computed stand at hours and temperatures of their own, exposures of a plan at others.
+        asked = needs(extended.template).conditions - needs(model.template).conditions
+        if changing := [column for condition, column in NOT_CHOSEN.items() if condition in asked]:
+            what = f"{name} grows with {' and '.join(changing)}, which no plan chooses"
             raise ValueError(f"{what}; leave it out")
         stated[name] = not alone
         for p in extended.parameters if alone else ():
