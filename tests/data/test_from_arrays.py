@@ -85,6 +85,12 @@ def test_the_level_of_the_sky_comes_back():
     assert made().to_arrays()["sky"] is None
 
 
+def test_a_turn_is_an_angle_in_a_table_too():
+    table = made(chwp_in=True, chwp_angle=10.0, chwp_turn=np.deg2rad(30.0) * units.rad).to_table()
+    assert {table[name].unit for name in ("CHWP_TURN", "CHWP_ANGLE", "CLP_ANGLE", "RA")} == {units.deg}
+    np.testing.assert_allclose(table["CHWP_TURN"], 30.0)
+
+
 def test_units_are_converted():
     calset = made(x=X * 60 * units.arcmin, angles=np.deg2rad(ANGLES) * units.rad, temp=283.15 * units.K)
     np.testing.assert_allclose(calset.points.x, X, rtol=1e-14)

@@ -394,13 +394,11 @@ class CalibrationSet(Displayed):
 
     def to_table(self) -> Any:
         """The exposures as an astropy table, with the columns of EXPOSURES."""
-        units = {"MJD": "d", "EXPTIME": "s", "TEMP": "Celsius", "HA": "h", "TEFF": "K"}
-        angles = ("RA", "DEC", "ROTATOR")
-        columns = {
-            name: (values, "deg" if name in angles or name.endswith("_ANGLE") else units.get(name, ""), "")
-            for name, values in self.exposures.columns().items()
-        }
-        return astropy_table(columns)
+        columns = self.exposures.columns()
+        angles = [name for name in columns if name.endswith(("_ANGLE", "_TURN"))]
+        units = dict.fromkeys((*angles, "RA", "DEC", "ROTATOR"), "deg")
+        units |= {"MJD": "d", "EXPTIME": "s", "TEMP": "Celsius", "HA": "h", "TEFF": "K"}
+        return astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})
 
 
 class Intensities:
