@@ -207,7 +207,7 @@ MOST_LINES = {
     "science": 5822,
     "diagnosis": 7943,
     "nights": 2598,
-    "plans": 2212,
+    "plans": 2219,
     "paper": 775,
     "reports": 2690,
     "commands": 4081,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 
@@ -102,10 +103,24 @@ def test_a_standard_has_all_places_of_its_raster_and_stars_of_a_field_scatter():
     assert known[-1] == pytest.approx(6 / 0.05**2, rel=1e-2)
 
 
-def test_fewer_points_are_those_of_the_grid():
-    """Every place of a raster is there to be chosen."""
-    few, factor = fewer_points(ObservingPlan())
-    assert (few.grid, few.standard_grid, factor) == (6, 5, 4.0)
+def test_fewer_points_have_the_sums_of_all():
+    """Of polynomials, by the 144 points themselves: uneven weights, for at the edge they are further apart."""
+    plan = ObservingPlan()
+    few, weight = fewer_points(plan)
+    assert len(weight) == len(few.points()) == 49 + 25
+    assert (weight > 0).all()
+    assert (weight[49:] == 1).all()
+    of_plan, of_few = plan.points(), few.points()
+    for i, j in itertools.product(range(7), repeat=2):
+        total = np.sum(of_plan.x[:144] ** i * of_plan.y[:144] ** j)
+        part = np.sum(weight[:49] * of_few.x[:49] ** i * of_few.y[:49] ** j)
+        assert part == pytest.approx(total, rel=1e-9, abs=1e-12)
+    np.testing.assert_allclose(fewer_points(SMALL)[1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(fewer_points(ObservingPlan.bench(11))[1].sum(), 11.0)
+
+
+def test_every_place_of_a_raster_is_there_to_be_chosen():
+    few, _ = fewer_points(ObservingPlan())
     choices, _ = Available(ObservingPlan(), places=True).choices()
     (standards,) = (choice for choice in choices if choice.kind == "standard")
     assert with_stops(few, standards.stops).layout()[0].sum() == 8 * 25
@@ -126,7 +141,7 @@ def test_what_a_calibration_knows_holds_its_priors_once():
 
 def test_errors_have_the_floor_of_the_instrument():
     """Two cameras, by hand: both errors 1 % of the mean of 6·10⁵ and 4·10⁵, the flux eliminated."""
-    light = Illumination(np.array([1e6]), PhotonNoise(1.0), 0.01, Sharing(None), 1.0)
+    light = Illumination(np.array([1e6]), PhotonNoise(1.0), 0.01, Sharing(None), np.ones(1))
     information = light.information(np.array([[[0.6, 0.4]]]), np.array([[[[1.0], [-1.0]]]]))
     assert information[0, 0, 0] == pytest.approx(2 * 200.0**2 - 40.0**2 / 0.52, rel=1e-12)
     gain = light.gain(np.array([[[0.6], [0.4]]]), np.array([[[1.0], [-1.0], [1.0]]]))
@@ -423,7 +438,7 @@ def test_stars_of_a_field_tell_no_more_of_their_mean_than_their_scatter_allows()
     slopes = np.zeros((6, 1, 4, 3))
     slopes[..., 0], slopes[..., 1] = [0.25, -0.25, 0.0, 0.0], [0.0, 0.0, 0.25, -0.25]
     slopes[..., 2] = rng.normal(size=(6, 1, 4)) * 0.1
-    light = Illumination(np.full(6, 4e10), PhotonNoise(30.0), 0.0, Sharing(), 1.0, {0: size, 1: size})
+    light = Illumination(np.full(6, 4e10), PhotonNoise(30.0), 0.0, Sharing(), np.ones(6), {0: size, 1: size})
     found = light.information(unit, slopes)[0]
     np.testing.assert_allclose(np.diag(found)[:2], 6.0 / size**2, rtol=1e-3)
     alone = light._replace(scatter={}).information(unit, slopes)[0]

@@ -54,8 +54,8 @@ ANGLES = 361
 So many since errors vary quickly where a camera is dark: over some √(σ²/N) rad, N its counts in full light."""
 ORDERS = (128, 64)
 """Degrees of that series in 2(2α − θ) and in 2α where the calibration plate may stand at any angle α."""
-GRID = 6
-"""Field points along each axis at which the information is computed, scaled to those of the plan."""
+GRID = 7
+"""Field points along each axis at which the information is computed, each for some of the plan (`fewer_points`)."""
 DRAWS = 20
 NOT_CHOSEN = {condition: column for condition, column in CONDITIONS.items() if condition != "exptime"}
 """Conditions of an exposure that are as they come, and their columns."""
@@ -122,7 +122,7 @@ def candidates(
     choices, notes = available.choices()
     if not choices:
         raise ValueError("; ".join(("nothing could be observed", *notes)))
-    few, factor = fewer_points(available.plan)
+    few, weight = fewer_points(available.plan)
     turn = 360.0 if effects else 180.0
     choices = tuple(choice._replace(turn=turn) for choice in choices)
     stops = [_nodes(choice, bool(effects)) for choice in choices]
@@ -150,12 +150,11 @@ def candidates(
 
     def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[Counts, ...]]:
         """The light of some exposures of a choice, and their counts in every draw."""
-        at, star = likelihood.used[:, rows.start], choice.kind == "standard"
+        at = likelihood.used[:, rows.start]
         electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
-        of_field = star and plan.stops[rows.start].number == plan.standards
+        of_field = choice.kind == "standard" and plan.stops[rows.start].number == plan.standards
         scatter = plan.zero_scatter if of_field else 0.0
-        scale, of_stars = 1.0 if star else factor, dict.fromkeys(means, scatter)
-        lit = Illumination(electrons, noise, floor, shared, scale, of_stars)
+        lit = Illumination(electrons, noise, floor, shared, weight[at], dict.fromkeys(means, scatter))
         return lit, tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
 
     families: list[Family] = []
@@ -209,11 +208,18 @@ def _with(
     return extended, stated
 
 
-def fewer_points(plan: ObservingPlan) -> tuple[ObservingPlan, float]:
-    """The same over fewer field points, spread alike, and by how many times fewer; standards keep all their places."""
+def fewer_points(plan: ObservingPlan) -> tuple[ObservingPlan, Float[np.ndarray, " p"]]:
+    """The same over fewer field points, and for how many of the plan each of them stands; those of stars stay.
+
+    Along each axis polynomials of a degree below the number of points have the same sum over both.
+    """
     few = dataclasses.replace(plan, grid=min(plan.grid, GRID))
-    stars = (plan.standard_grid**2 if plan.standards else 0) + plan.zero_stars
-    return few, (len(plan.points()) - stars) / (len(few.points()) - stars)
+    sides = (np.linspace(-1.0, 1.0, p.grid) if p.grid > 1 else np.zeros(1) for p in (plan, few))
+    sums, series = (np.polynomial.legendre.legvander(side, few.grid - 1) for side in sides)
+    along = np.linalg.solve(series.T, sums.sum(axis=0))
+    points = len(few.points()) - (plan.standard_grid**2 if plan.standards else 0) - plan.zero_stars
+    weight = along if points == few.grid else np.outer(along, along).ravel()
+    return few, np.append(weight, np.ones(len(few.points()) - points))
 
 
 def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Float[np.ndarray, "r n"]:
@@ -270,16 +276,16 @@ def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarr
 class Illumination(NamedTuple):
     """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
-    No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `scale`
-    leads from these points to those of the plan. `scatter` is the rms of single stars around a parameter, by its place;
-    each exposure counts as one of other stars.
+    No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `weight`
+    is for how many points of the plan each of them stands. `scatter` is the rms of single stars around a parameter, by
+    its place; each exposure counts as one of other stars.
     """
 
     flux: Float[np.ndarray, " p"]
     noise: simulation.PhotonNoise
     floor: float
     shared: Sharing
-    scale: float
+    weight: Float[np.ndarray, " p"]
     scatter: Mapping[int, float] = MappingProxyType({})
 
     def information(
@@ -295,8 +301,9 @@ class Illumination(NamedTuple):
             stars = np.stack([size * projected[place] for place, size in self.scatter.items()], axis=-1)
             alone = Sharing(stars=of_low_rank(stars[:, :, None]))
             projected = alone.independent(projected[..., None, :])[..., 0, :]
+        projected = projected * np.sqrt(self.weight)[:, None, None]
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
-        return self.scale * flat @ flat.swapaxes(1, 2)
+        return flat @ flat.swapaxes(1, 2)
 
     def gain(
         self, unit: Float[np.ndarray, "p k s"], squares: Float[np.ndarray, "p t s"]
@@ -317,7 +324,7 @@ class Illumination(NamedTuple):
                 gain += (weight[:, k] - weighted[:, k] * share[:, k]) * squares[:, pair]
             elif together[k, m]:
                 gain -= 2.0 * weighted[:, k] * share[:, m] * squares[:, pair]
-        return self.scale * (self.flux**2) @ gain
+        return (self.weight * self.flux**2) @ gain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -402,7 +409,7 @@ class Polarised(Family):
                 squares = (along @ along.swapaxes(2, 3))[:, :, *np.triu_indices(unit.shape[2])]
                 squares = squares.transpose(1, 2, 0)
                 u = np.tensordot(weights, unit[chunk], (1, 1)).transpose(1, 2, 0)
-                light = self.light._replace(flux=self.light.flux[chunk])
+                light = self.light._replace(flux=self.light.flux[chunk], weight=self.light.weight[chunk])
                 total += light.gain(_refined(u, finer), _refined(squares, finer))
         return total.reshape([len(f) for f in finer])
 
