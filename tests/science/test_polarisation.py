@@ -58,6 +58,8 @@ def test_axes_do_not_matter():
         ([1e-5, 0.002], [[1e-12, 0.0], [0.0, 1e-4]]),
         ([0.002, 0.001], [[1e-6, 5e-7], [5e-7, 2e-6]]),
         ([0.0, 0.0045], [[1e-6, 0.0], [0.0, 1e-6]]),
+        ([0.010, 0.0], [[1e-6, 0.0], [0.0, 4e-4]]),  # p is ten of its errors, half of one across
+        ([0.010, 0.0], [[1e-6, 0.0], [0.0, 2.5e-5]]),
     ],
 )
 def test_angles_of_weak_light_scatter_as_drawn_ones(qu, covariance):

@@ -3,9 +3,10 @@
     p = √(q² + u²),    EVPA = ½ arctan2(u, q),    n = (q, u)/p,    t = (−u, q)/p
 
 Errors      σ_p² = nᵀ C n;  σ_EVPA = σ_t / 2p with σ_t² = tᵀ C t, and no more than 180°/√12, that of a
-            uniform distribution. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0: there it is the rms
-            distance, within half a turn, of the angles of a normal distribution about (q, u) from EVPA. Where C = 1 and
-            m = |(q, u)|, the angle α of the vectors from that of their mean has the density
+            uniform distribution. Where p < 5 σ_p, (q, u) may as well lie on the other side of 0, and where p < 5 σ_t
+            angles are no small ones: there it is the rms distance, within half a turn, of the angles of a normal
+            distribution about (q, u) from EVPA. Where C = 1 and m = |(q, u)|, the angle α of the vectors from that of
+            their mean has the density
             f(α) = φ(m) (1 + b Φ(b)/φ(b)) / √(2π), b = m cos α, φ and Φ the normal density and its integral
             (Mardia 1972, Statistics of Directional Data, 3.4); C^½ takes it to any other C
 Bias        Noise across the direction of (q, u) only ever lengthens the vector: <p> ≈ p₀ + σ_t²/2p₀. Two
@@ -26,7 +27,7 @@ from scipy import special
 
 Vector = Float[np.ndarray, " s"]
 ESTIMATORS = ("MAS", "WK")
-_CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096  # σ_p from which C alone counts; angles, and stars at once
+_CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096  # σ from which C alone counts; angles, and stars at once
 NO_ANGLE = 180.0 / np.sqrt(12.0)  # standard deviation (deg) of an angle of which nothing is known
 
 
@@ -61,7 +62,8 @@ def polarisation(
         else:
             debiased = np.sqrt(np.maximum(p**2 - across, 0.0))
         error = np.minimum(np.rad2deg(np.sqrt(across) / (2.0 * p)), NO_ANGLE)
-    weak = np.flatnonzero((p**2 < (1.0 - 1e-9) * _CERTAIN**2 * along) & (qq * uu > qu_**2))
+    least = (1.0 - 1e-9) * _CERTAIN**2 * np.maximum(along, across)
+    weak = np.flatnonzero((p**2 < least) & (qq * uu > qu_**2))
     for chunk in np.array_split(weak, len(weak) // _TOGETHER + 1):
         error[chunk] = _spread_of_angles(qu[chunk], covariance[chunk])
     angle = np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)
