@@ -14,7 +14,7 @@ from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, colour_weights
 from walop_jax.data.settings import Settings
-from walop_jax.data.user_tables import read_input_table
+from walop_jax.data.user_tables import in_memory, read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import effect_by_name
@@ -352,6 +352,7 @@ def test_errors_of_a_detector_grow_with_the_light(calset, calibration, tmp_path,
     covariance[index, index] = 1e-6
     there = dataclasses.replace(there, covariance=covariance)
     table, _ = stars(AnalysisVectors(calibration), 6, flux=flux)
+    table["N"] *= 1 + 0.02 * table["N"] / 1e6  # without residuals, which move stars as weights change
     found = []
     for sign in (1, -1):
         values = there.values.copy()
@@ -361,6 +362,23 @@ def test_errors_of_a_detector_grow_with_the_light(calset, calibration, tmp_path,
     stated = np.sqrt(np.einsum("sii->si", apply(there, read(table, tmp_path)).calibration))
     np.testing.assert_allclose(stated, np.abs(shift), rtol=1e-3, atol=1e-9)
     assert stated.max() > 3e-4 * flux / 4e6
+
+
+def test_photon_errors_are_those_of_linearised_counts(calset, calibration):
+    """1.7·10⁶ electrons of which 5 % are not reported: noise is enlarged by 1/(1 − 0.1) when they are put back."""
+    effect = effect_by_name("nonlinearity").of(_context(calset), coefficient=-0.03)
+    there = _with(calibration, with_effects(calibration.model, [effect], _context(calset)))
+    (seen,) = AnalysisVectors(calibration).exact(setting(), np.array([0.1]), np.array([0.05]))[:, 0]
+    arriving = np.broadcast_to(8e6 * seen @ [1.0, 0.01, 0.005], (2000, 4))
+    expected = arriving * (1 - 0.03 * arriving / 1e6)
+    noise = np.sqrt(expected) * np.random.default_rng(9).standard_normal(expected.shape)
+    place = {"X": np.full(2000, 0.1), "Y": np.full(2000, 0.05)}
+    table = Table({**place, "N": expected + noise, "N_ERR": np.sqrt(expected)})
+    found = apply(there, read_catalogue(in_memory(table), SOUTH))
+    assert found.chi2.mean() == pytest.approx(1.0, abs=0.12)  # 1.3 with the errors of the counts as measured
+    assert found.check.warnings() == ()
+    scatter = np.cov(found.qu.T)
+    np.testing.assert_allclose(np.diag(found.photon[0]), np.diag(scatter), rtol=4 * np.sqrt(2 / 2000))
 
 
 def _context(calset):

@@ -26,7 +26,7 @@ from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
-from walop_jax.science.detectors import detector_slopes, linearised
+from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.left_over_sky import with_sky
@@ -160,6 +160,7 @@ class _Application:
         if not force:
             check_validity(calibration, catalogue.points.settings)
         self.counts = linearised(calibration, catalogue.counts)
+        self.sigma = errors_of(calibration, self.counts, catalogue.sigma)
         self.offset, self.slope = _rotator_zero(self.vectors)
         self.order = np.argsort(catalogue.star, kind="stable")
         self.on_sky = bool(np.isfinite(catalogue.rotator).any())
@@ -172,7 +173,7 @@ class _Application:
     def block(self, rows: Rows) -> _Block:
         """Stokes parameters of some stars."""
         catalogue, vectors, setting_of = self.catalogue, self.vectors, self.setting_of[rows]
-        points, sigma, counts = catalogue.points, catalogue.sigma[rows], self.counts[rows]
+        points, sigma, counts = catalogue.points, self.sigma[rows], self.counts[rows]
         _, star = np.unique(catalogue.star[rows], return_inverse=True)
         first = np.flatnonzero(np.diff(star, prepend=-1))
         outside = self.outside(rows)
@@ -267,7 +268,7 @@ class _Application:
 
     def flags(self, rows: Rows, counts: OfRows, first: OfStars, found: Estimate) -> OfStars:
         """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
-        points, sigma = self.catalogue.points, self.catalogue.sigma[rows]
+        points, sigma = self.catalogue.points, self.sigma[rows]
         settings, calibration = points.settings[rows], self.vectors.calibration
         bits = calibration.flags(points.x[rows], points.y[rows], settings)
         bits[calibration.beyond_settings(settings)] |= Quality.VALIDITY_FORCED

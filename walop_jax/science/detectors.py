@@ -1,13 +1,14 @@
 """Detectors that are not linear: counts of a catalogue, corrected with a calibration.
 
 Equation    reported(N, θ) = counts as measured, solved for N by fixed-point steps;
-            dN/dθ = −(∂reported/∂θ) / (∂reported/∂N)
-Symbols     N counts (electrons) that arrive, θ coefficients of the detectors
+            dN/dθ = −(∂reported/∂θ) / (∂reported/∂N),    σ(N) = σ(measured) / (∂reported/∂N)
+Symbols     N counts (electrons) that arrive, θ coefficients of the detectors, σ standard errors
 Limits      Responses within some per cent of linear: each step gains as many digits as the first one is small.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import jax
@@ -33,6 +34,18 @@ def linearised(calibration: Calibration, counts: Float[np.ndarray, "n k"]) -> Fl
     for _ in range(_ROUNDS):
         true = true + (counts - np.asarray(reported(instrument, jnp.asarray(true))))
     return true
+
+
+def errors_of(
+    calibration: Calibration, counts: Float[np.ndarray, "n k"], sigma: Float[np.ndarray, "n k"]
+) -> Float[np.ndarray, "n k"]:
+    """Standard errors of linearised `counts`, from those of the counts as measured (`sigma`)."""
+    instrument = calibration.model.instrument(calibration.values)
+    if light.is_linear(instrument):
+        return sigma
+    true = jnp.asarray(np.nan_to_num(counts))
+    _, slope = jax.jvp(functools.partial(reported, instrument), (true,), (jnp.ones_like(true),))
+    return sigma / np.abs(np.asarray(slope))
 
 
 def detector_slopes(
