@@ -7,11 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 from astropy.table import Table
-from star_tables import read, stars
+from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Hidden, Quality, Structure
 from walop_jax.science.apply import apply
+from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.stokes_columns import about_counts
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")
@@ -169,6 +171,33 @@ def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vector
     plain = apply(known, read(clean, tmp_path))
     np.testing.assert_allclose(plain.hidden, np.abs(other.qu - plain.qu), rtol=0.02, atol=1e-6)
     assert np.isnan(apply(calibration, read(clean, tmp_path)).hidden).all()
+
+
+@pytest.mark.parametrize("rotator", [(0.0, 90.0), (0.0, 0.0)])
+def test_structure_is_another_at_another_place(vectors, calibration, rotator):
+    """Gains of 2·10⁻³, drawn anew at the second place: turned by 90° q and u do not lose them, as at one place."""
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(-0.2, 0.2, (2, 1000))
+    qu, rows = rng.normal(0.0, 0.01, (1000, 2)), []
+    for k, angle in enumerate(rotator):
+        cos, sin = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+        here = cos * x + sin * y + (0.05 if k and not angle else 0.0), cos * y - sin * x
+        seen = qu @ [1, 1j] * np.exp(-2j * np.deg2rad(angle))
+        s = np.stack([np.ones(1000), seen.real, seen.imag], axis=1)
+        n = 4e6 * np.einsum("pks,ps->pk", vectors.exact(setting(), *here)[:, 0], s)
+        n *= 1.0 + 2e-3 * rng.standard_normal(n.shape)
+        columns = {"ID": np.arange(1000), "X": here[0], "Y": here[1], "ROTATOR": np.full(1000, angle)}
+        rows.append(
+            Table(columns | {"N": n + np.sqrt(n) * rng.standard_normal(n.shape), "N_ERR": np.sqrt(n)})
+        )
+    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3))
+    certain = np.zeros_like(calibration.covariance)  # what all stars have in common is no scatter
+    known = dataclasses.replace(calibration, verdict=verdict, covariance=certain)
+    table = Table({name: np.concatenate([r[name] for r in rows]) for name in rows[0].colnames})
+    found = apply(known, read_catalogue(in_memory(table), SOUTH))
+    np.testing.assert_allclose(pulls(found, qu), 1.0, atol=0.1)
+    assert found.check.noise == pytest.approx(1.0, abs=0.1)
+    assert found.check.holds
 
 
 @pytest.mark.parametrize("seed", [1, 2])

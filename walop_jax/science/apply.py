@@ -30,7 +30,7 @@ from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.left_over_sky import with_sky
-from walop_jax.science.star_residuals import StarResiduals
+from walop_jax.science.star_residuals import StarResiduals, by_place
 from walop_jax.sky.moon import sky_to_instrument
 
 OfRows = Float[np.ndarray, "r k"]  # by row and camera
@@ -229,11 +229,14 @@ class _Application:
         calibration = root @ root.swapaxes(1, 2)
         structure = vectors.calibration.verdict.structure
         if structure:
-            # A gain of every camera at the place of the star, the same in all of its rows.
+            # A gain of every camera at each place of the star, the same in all rows there.
             lit = np.einsum("rks,rs->rk", mixed, s)
-            gain_shift = calibration_shift(fitted.gain, lit[:, :, None] * np.eye(vectors.cameras), star)
-            square = structure.gain**2 + structure.response**2 * np.sum(fitted.qu**2, axis=1)
-            calibration = calibration + square[:, None, None] * (gain_shift @ gain_shift.swapaxes(1, 2))
+            place, of_place = by_place(star, x, y)
+            shifts, square = np.zeros((len(of_place), 2, vectors.cameras)), np.zeros_like(calibration)
+            np.add.at(shifts, place, fitted.gain * lit[:, None])
+            np.add.at(square, of_place, shifts @ shifts.swapaxes(1, 2))
+            variance = structure.gain**2 + structure.response**2 * np.sum(fitted.qu**2, axis=1)
+            calibration = calibration + variance[:, None, None] * square
         nothing = np.zeros_like(calibration)
         spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
         teff_err = catalogue.teff_err[rows]

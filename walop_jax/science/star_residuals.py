@@ -29,6 +29,7 @@ from scipy import special
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.optics import through_series
+from walop_jax.science.catalogue import ANOTHER_PLACE
 
 CHECKED_ROWS = 2048
 """Rows whose columns for the check of a catalogue are worked on together: a hundred columns of them take 7 MB."""
@@ -161,14 +162,44 @@ class StarResiduals:
 
 def own_variance(stars: StarResiduals) -> OfStars:
     """Variance of residuals over that of noise: unknown colours and structure of the field add to it."""
-    spread = np.zeros(len(stars.photon))
-    columns = [stars.colour[..., n] for n in range(stars.colour.shape[-1])] if stars.colour.any() else []
+    spread, most = np.zeros(len(stars.photon)), stars.model.shape[1] - 1
+    for n in range(stars.colour.shape[-1] if stars.colour.any() else 0):
+        spread += stars.chi2(stars.left(stars.colour[..., n]))
     if stars.structure > 0:
-        columns += [stars.structure * stars.model * unit for unit in np.eye(stars.model.shape[1])]
-    for column in columns:
-        spread += stars.chi2(stars.left(column))
+        of_gains, places = _of_gains(stars)
+        spread, most = spread + stars.structure**2 * of_gains, most * places
     # Gains of the cameras make fewer independent residuals than a star of several rows has.
-    return 1.0 + spread / np.clip(stars.dof, 1, stars.model.shape[1] - 1)
+    return 1.0 + spread / np.clip(stars.dof, 1, most)
+
+
+def _of_gains(stars: StarResiduals) -> tuple[OfStars, Int[np.ndarray, " s"]]:
+    """Sum of cᵀ P c of every star over the gains of its cameras, one at each of its places; how many places it has."""
+    spread, number = np.zeros(len(stars.photon)), np.zeros(len(stars.photon), int)
+    for numbers, _, part in stars.blocks():
+        free, _ = part.projected(part.model[..., None] * np.eye(part.model.shape[1]))
+        half = np.linalg.cholesky(part.photon).swapaxes(1, 2)[part.star]
+        place, of_place = by_place(part.star, part.x, part.y)
+        along = np.zeros((len(of_place), 2, len(free)))
+        np.add.at(along, place, half @ np.einsum("rik,crk->ric", part.tangent, free, optimize=True))
+        taken = np.bincount(of_place, np.sum(along**2, axis=(1, 2)))
+        spread[numbers] = np.bincount(part.star, np.sum(free**2, axis=(0, 2))) - taken
+        number[numbers] = np.bincount(of_place)
+    return spread, number
+
+
+def by_place(
+    star: Int[np.ndarray, " r"], x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"]
+) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " p"]]:
+    """The place of every row, counted over all stars, and the star of every place; rows of a star follow each other.
+
+    Positions (deg) of a star are at one place that lie in one cell of `ANOTHER_PLACE`, its first row in the middle of
+    such a cell.
+    """
+    position = np.stack([x, y], axis=1)
+    from_first = position - position[np.flatnonzero(np.diff(star, prepend=-1))][star]
+    key = np.column_stack([star, np.round(from_first / ANOTHER_PLACE)])
+    places, place = np.unique(key, axis=0, return_inverse=True)
+    return place.reshape(-1), places[:, 0].astype(int)
 
 
 class Weights(NamedTuple):
