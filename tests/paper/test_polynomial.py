@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.settings import Settings
+from walop_jax.fit.verdict import Structure
 from walop_jax.io.errors import DataError
 from walop_jax.paper import comparison
 from walop_jax.paper import polynomial as paper
@@ -161,8 +165,6 @@ def test_too_few_angles_are_refused():
 @pytest.mark.long
 def test_promised_errors_are_the_covariance(calibration):
     """Against a set of wrong calibrations: root mean square of `joint_errors` over draws."""
-    import dataclasses
-
     analysis, setting = AnalysisVectors(calibration), Settings.default(1)
     x, y, stars = np.array([-0.1, 0.05, 0.2]), np.array([-0.1, -0.2, 0.1]), paper.sample_stars(5)
     promised = accuracy.promised_errors(analysis, setting, x, y, stars)
@@ -179,3 +181,12 @@ def test_promised_errors_are_the_covariance(calibration):
         )
     ratio = np.sqrt(np.mean(squares, axis=0)) / promised
     assert np.all((ratio > 0.7) & (ratio < 1.35))
+
+
+def test_promised_errors_hold_the_structure_of_field_points(calibration):
+    """Gains and responses of 2·10⁻³: the error of p is that by the matrix, whose covariance has them in closed form."""
+    verdict = dataclasses.replace(calibration.verdict, structure=Structure(gain=2e-3, response=2e-3))
+    there = dataclasses.replace(calibration, verdict=verdict)
+    x, y, stars = np.array([-0.1, 0.05, 0.2]), np.array([-0.1, -0.2, 0.1]), paper.sample_stars(5)
+    promised = accuracy.promised_errors(AnalysisVectors(there), Settings.default(1), x, y, stars)
+    np.testing.assert_allclose(promised[:, 2], p_errors(*there.matrix(x, y), stars), rtol=0.05)

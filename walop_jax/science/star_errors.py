@@ -64,7 +64,7 @@ def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, 
 def promised_errors(
     analysis: AnalysisVectors, setting: Settings, x: Places, y: Places, stars: Float[np.ndarray, "n 2"]
 ) -> Errors:
-    """Errors that the covariance of the calibration promises, rms over the stars."""
+    """Errors that the calibration promises, by its covariance and the structure of field points; rms over the stars."""
     vectors = analysis.coloured(setting, x, y)
     counts = _ELECTRONS * transmitted(vectors, stars)
     n, rows = len(stars), counts.reshape(-1, counts.shape[-1])
@@ -73,11 +73,16 @@ def promised_errors(
     local = analysis.derivatives(setting, x, y, np.full(len(x), np.nan))
     gain = stokes.gain.reshape(len(x), n, 2, -1)
     s = np.concatenate([np.ones((n, 1)), stars], axis=1)
+    structure, degree = analysis.calibration.verdict.structure, np.hypot(*stars.T)
+    of_point = (
+        np.hypot(structure.gain, structure.response * degree)[:, None, None] * counts[:, :, None] / _ELECTRONS
+    )
     total = np.zeros((len(x), 3))
     for k in range(n):
         plain, throughput = (gain[:, k] @ np.einsum("s,pksf->pkf", s[k], slopes) for slopes in local)
         root = analysis.to_parameters(plain, throughput, x, y) @ analysis.root
-        radial = np.einsum("c,pck->pk", stars[k] / np.hypot(*stars[k]), root)
+        root = np.concatenate([root, gain[:, k] * of_point[:, k]], axis=2)
+        radial = np.einsum("c,pck->pk", stars[k] / degree[k], root)
         total += np.stack([*np.sum(root**2, axis=2).T, np.sum(radial**2, axis=1)], axis=1)
     return np.sqrt(total / n)
 
