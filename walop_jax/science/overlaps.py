@@ -1,9 +1,10 @@
 """Stars seen at several places of the field: their q and u there are the same, unless an error depends on the place.
 
-    χ² = Σ dᵀ W d      W = (C_photon + k C_calibration)⁻¹,  d = (q, u) of a row less the mean of its star, weighted by W
+    χ² = Σ dᵀ W d      W = (C_photon + k C_other)⁻¹,  d = (q, u) of a row less the mean of its star, weighted by W
 
-Errors of the calibration are common to all stars and have k = `COMMON`, so that they raise no alarm by themselves. The
-sum of the cameras has no part in χ², so that it sees errors that no other check of a catalogue does.
+C_other is all else that Q_ERR holds: calibration, colours, changes that the catalogue shows. Such errors are common to
+all stars and have k = `COMMON`, so that they raise no alarm by themselves. The sum of the cameras has no part in χ², so
+that it sees errors that no other check of a catalogue does.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ def extents(catalogue: Catalogue) -> Float[np.ndarray, " s"]:
 def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = False) -> Overlap | None:
     """Comparison of q and u of stars at several places, each row by itself; None where no star is seen so.
 
-    Of more than `STAR_SAMPLE` rows the first are compared. Raises `DataError` as `apply` does.
+    None, too, where rows do not hold q and u, each by itself. Of more than `STAR_SAMPLE` rows the first are compared.
+    Raises `DataError` as `apply` does.
     """
     chosen = (extents(catalogue) > APART)[catalogue.star]
     chosen &= catalogue.star < np.sort(catalogue.star[chosen])[:STAR_SAMPLE].max(initial=-1) + 1
@@ -69,8 +71,10 @@ def overlap(calibration: Calibration, catalogue: Catalogue, *, force: bool = Fal
         return None
     subset = catalogue.of_rows(chosen)
     by_row = apply(calibration, dataclasses.replace(subset, star=np.arange(len(subset))), force=force)
-    covariance = by_row.photon + COMMON * by_row.calibration
+    covariance = by_row.photon + COMMON * (by_row.covariance - by_row.photon)
     good = np.isfinite(by_row.qu).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    if not good.any():
+        return None
     number, qu, covariance = subset.star[good], by_row.qu[good], covariance[good]
     weight = np.linalg.inv(covariance)
 
