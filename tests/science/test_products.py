@@ -18,9 +18,9 @@ from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_calibration
 from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.base_model import model_for
+from walop_jax.fit.base_model import base_model, model_for
 from walop_jax.fit.refit import fit, refit, with_honest_errors
-from walop_jax.fit.verdict import Doubt, Quality
+from walop_jax.fit.verdict import Doubt, Quality, Structure
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import with_effects
@@ -229,6 +229,38 @@ def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_al
     error = 100 * np.median(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), axis=0)
     for seen, of_one in zip(found.visible.values(), error, strict=True):
         assert 3.0 * of_one < seen <= 5.0 * np.sqrt(2.0) * of_one * (1.0 + 1e-6)
+
+
+def test_errors_of_a_catalogue_that_both_fits_take_are_no_change():
+    """Standards alone fix the polarisation of the telescope: noise is in the change, errors of their catalogue are not.
+
+    The estimate is C Jᵀ(data) + C P(priors), so that data alone scatter it by C JᵀJ C with JᵀJ = C⁻¹ − P.
+    """
+    effect = effect_by_name("telescope_polarisation")
+    calset = simulate(SMALL, seed=5, effects=[effect.of(SMALL.context(), q=0.004, u=-0.002)]).calset
+    table, width = calset.intensities, np.full(len(calset.sources.q), 1e-3)
+    moon = (calset.exposures.kind == "moon")[table.exposure]
+    dim = dataclasses.replace(table, sigma=np.where(moon[:, None], 1e3 * table.sigma, table.sigma))
+    stars = dataclasses.replace(calset.sources, q_err=width, u_err=width)
+    calset = dataclasses.replace(calset, intensities=dim, sources=stars, inputs=())
+    model = with_effects(base_model(calset), [effect.neutral(SMALL.context())], SMALL.context())
+    result = refit(calset, model).judged()
+    found = epoch(Calibration.from_fit(result), result)
+    c = result.covariance[np.ix_(model.free, model.free)]
+    prior = np.array([(model.parameters[i].prior or (0.0, np.inf))[1] ** -2.0 for i in model.free])
+    size = np.sqrt(np.diag(c))  # numbers of parameters differ by orders of magnitude
+    data = np.linalg.inv(c / np.outer(size, size)) / np.outer(size, size) - np.diag(prior)
+    noise = np.sqrt(2.0 * np.diag(c @ data @ c))
+    moved = {entry.name: entry.error for entry in found.moved}
+    for axis in "qu":
+        name = f"telescope_polarisation.{axis}"
+        at = list(model.free).index(model.index(name))
+        assert moved[name] == pytest.approx(noise[at], rel=0.01)
+        assert moved[name] < 0.7 * np.sqrt(2.0) * size[at]
+    # The parameters are compared, which the structure of field points leaves as certain as they are.
+    verdict = dataclasses.replace(result.checked_verdict(), structure=Structure(gain=2e-3))
+    structured = dataclasses.replace(result, verdict=verdict)
+    assert epoch(Calibration.from_fit(structured), structured).visible == pytest.approx(found.visible)
 
 
 def test_of_many_changes_the_largest_is_held_to_their_number():

@@ -17,8 +17,9 @@ itself has left, and Δ is nothing beside them. Then the comparison is with the 
 new data (`diagnosis`): the amplitudes of effects that it has and the old one lacks have changed from zero, which the
 old calibration holds them at. Without such a model there is nothing to compare with.
 
-P is the inverse covariance of the priors: both fits lean on the same ones, which makes them more alike than two
-independent measurements; where neither has measured anything V vanishes, and such directions are left out.
+P is the inverse covariance of the priors, those of standards included that have the same catalogue value in both: both
+fits lean on the same ones, which makes them more alike than two independent measurements; where neither has measured
+anything V vanishes, and such directions are left out.
 """
 
 from __future__ import annotations
@@ -38,11 +39,13 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS, model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.verdict import NO_STRUCTURE
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
+from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
 
@@ -204,15 +207,19 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     new = Calibration.from_fit(result)
     model = new.model
     shared, beyond = shared_parameters(old.model, model), added_amplitudes(old.model, model)
-    names = [*shared, *beyond]
+    names, stars = [*shared, *beyond], same_standards(old.model, model)
     a = np.array([old.model.index(name) for name in shared])
     b = np.array([model.index(name) for name in names])
     was = np.append(old.values[a], np.zeros(len(beyond)))
+    change = new.values[b] - was
+    # What both fits lean on: the priors of the instrument and of standards.
+    leaning = [*shared, *stars]
+    i, j = (np.array([m.index(name) for name in leaning]) for m in (old.model, model))
+    width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in leaning])
     before, after = np.zeros((len(b), len(b))), new.covariance[np.ix_(b, b)]
     before[: len(a), : len(a)] = old.covariance[np.ix_(a, a)]
-    change = new.values[b] - was
-    width = np.array([(model[name].prior or (0.0, np.inf))[1] for name in names])
-    product = before @ (after / width[:, None] ** 2)
+    product = np.zeros_like(before)
+    product[: len(a)] = old.covariance[np.ix_(a, i)] @ (new.covariance[np.ix_(j, b)] / width[:, None] ** 2)
     covariance = before + after - product - product.T
     sigma = np.sqrt(np.diag(before + after))
     units = [model[name].unit for name in names]
@@ -262,6 +269,12 @@ def shared_parameters(old: Model, new: Model) -> list[str]:
     """Names of the instrument's parameters that are free in both models."""
     free = [{m.parameters[i].name for i in m.free} for m in (old, new)]
     return [name for name in new.names if name in free[0] & free[1] and new[name].part not in SKY_AND_STARS]
+
+
+def same_standards(old: Model, new: Model) -> list[str]:
+    """Names of the numbers of standards that both models take, free, from the same catalogue value."""
+    both = [p for p in new.parameters if p.part == Standards.name and p.name in old.names]
+    return [p.name for p in both if p.free and old[p.name].free and p.prior and p.prior == old[p.name].prior]
 
 
 def added_amplitudes(old: Model, new: Model) -> list[str]:
@@ -334,7 +347,12 @@ class MeasuredChange(NamedTuple):
 def _visible(changed: Calibration) -> dict[str, float]:
     """`SURE` errors of each matrix element, median over the field, per cent; the covariance is that of the change."""
     x, y = changed.raster(4)
-    name = str(np.unique(changed.exposures.filter)[-1])
+    # Field points differ by no less than before: it is the parameters that are compared.
+    verdict = dataclasses.replace(changed.verdict, structure=NO_STRUCTURE)
+    changed, name = (
+        dataclasses.replace(changed, verdict=verdict),
+        str(np.unique(changed.exposures.filter)[-1]),
+    )
     _, covariance = changed.matrix(x, y, changed.usual_settings(1, name))
     error = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
     elements = matrix_elements(len(changed.model.template.cameras.pairs))
