@@ -54,6 +54,22 @@ def test_a_no_go(change, words):
     assert found.document()["go"] is False
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"error": np.full((10, 10), np.nan)},  # both arms see the same direction: the matrix has no inverse
+        {"error": np.full((10, 10), 5.0), "with_u": np.zeros((10, 10), bool), "without_u": 1.0},
+    ],
+)
+def test_an_error_that_is_not_known_is_no_go(change):
+    found = accuracy(**change)
+    assert np.isnan(found.reached)
+    assert not certificate(small_fit(), found).go
+    assert found.document()["good_enough"] is False
+    assert dict(found.facts())["good for 0.1 %"].startswith("no: ")
+    assert "plate at 22.5°" in dict(found.facts())["what to do"]
+
+
 def test_what_is_not_trusted_is_no_go():
     bad = small_fit().judged(["the residuals hold patterns"])
     assert certificate(small_fit().remarked("a remark"), accuracy()).go

@@ -96,6 +96,8 @@ class FieldAccuracy:
         if self.without_u > 1.0 - SHARE and self.median <= allowed:
             strip = f"the strip without u ({100 * self.without_u:.0f} % of the field)"
             advice = f"observe {strip} with the plate at 22.5° as well"
+        if np.isnan(self.reached):
+            advice = "no single exposure measures both q and u: observe with the plate at 22.5° as well"
         asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
@@ -178,7 +180,9 @@ class Requirement:
 def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: bool = True) -> Requirement:
     limit = f"{two_digits(100 * allowed)} %"
     found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
-    return Requirement(f"p known to {limit} in {where}", not error > allowed, found, advice, needed)
+    return Requirement(
+        f"p known to {limit} in {where}", error <= allowed, found, advice, needed
+    )  # NaN: unknown
 
 
 def reached(error: Float[np.ndarray, "*p"]) -> float:
