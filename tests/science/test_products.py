@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scipy import stats
-from small_run import SMALL
+from small_run import SMALL, small_fit
 from typer.testing import CliRunner
 
 import walop_jax.science.epoch
+from walop_jax.calibration.accuracy import sample_stars
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify, validity
 from walop_jax.calibration.product import write_calibration
@@ -261,6 +262,26 @@ def test_errors_of_a_catalogue_that_both_fits_take_are_no_change():
     verdict = dataclasses.replace(result.checked_verdict(), structure=Structure(gain=2e-3))
     structured = dataclasses.replace(result, verdict=verdict)
     assert epoch(Calibration.from_fit(structured), structured).visible == pytest.approx(found.visible)
+
+
+def test_stars_turn_with_the_zero_of_the_rotator():
+    """An old zero that is 1° off turns (q, u) by 2°, and changes no p."""
+    result = small_fit()
+    new = Calibration.from_fit(result)
+    model = with_effects(
+        new.model, [effect_by_name("rotator_zero").of(SMALL.context(), angle=1.0)], SMALL.context()
+    )
+    at, values = [model.index(name) for name in new.model.names], model.start.copy()
+    values[at], covariance = new.values, np.zeros(2 * (len(values),))
+    covariance[np.ix_(at, at)] = new.covariance
+    old = dataclasses.replace(new, model=model, values=values, covariance=covariance)
+    errors = epoch(old, result).star_errors
+    degree = np.hypot(*sample_stars().T)
+    both = np.hypot(errors["q"]["rms"], errors["u"]["rms"])
+    assert both == pytest.approx(
+        100.0 * 2.0 * np.sin(np.deg2rad(1.0)) * np.sqrt(np.mean(degree**2)), rel=1e-6
+    )
+    assert errors["p"]["max"] < 1e-6
 
 
 def test_of_many_changes_the_largest_is_held_to_their_number():

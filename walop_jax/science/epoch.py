@@ -48,6 +48,7 @@ from walop_jax.model.conventions import matrix_elements
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
+from walop_jax.sky.moon import sky_to_instrument
 
 Vector = Float[np.ndarray, " k"]
 Matrix = Float[np.ndarray, "k k"]
@@ -366,7 +367,11 @@ def _star_errors(old: Calibration, new: Calibration) -> dict[str, dict[str, floa
     vectors = []
     for calibration in (old, new):
         analysis = AnalysisVectors(calibration)
-        vectors.append(np.stack([analysis.exact(setting, x, y)[:, 0] for setting in settings], axis=1))
+        a = np.stack([analysis.exact(setting, x, y)[:, 0] for setting in settings], axis=1)
+        # Stars are on the sky, against which each calibration turns the instrument by its own zero of the rotator.
+        zero = analysis.instrument.patched().rotator_zero
+        axes = sky_to_instrument(a[..., 1], a[..., 2], np.array(0.0 if zero is None else -float(zero)))
+        vectors.append(np.stack([a[..., 0], *axes], axis=-1))
     errors = joint_errors(vectors[0], vectors[1], sample_stars())
     return statistics(errors, determinant(vectors[1], pairs) >= SMALLEST_DETERMINANT)
 
