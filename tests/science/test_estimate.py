@@ -168,15 +168,21 @@ def test_arms_with_fluxes_of_their_own():
     s = np.concatenate([np.ones((3, 1)), qu[star]], axis=1)
     shift = calibration_shift(found.gain, np.einsum("rks,rs->rk", change, s)[..., None], star)[..., 0]
     np.testing.assert_allclose(moved.qu - found.qu, shift, rtol=0, atol=1e-10)
+    # Counts that a camera loses are as many of those of its arm, whatever light the other arm has.
+    lost = counts * shares * [0.0, 0.0, 1e-6, 0.0]
+    fainter = estimate(a, counts * shares - lost, sigma, star, pairs)
+    shift = calibration_shift(found.gain, found.relative(lost)[..., None], star)[..., 0]
+    np.testing.assert_allclose(fainter.qu - found.qu, shift, rtol=0, atol=1e-10)
 
 
-def test_an_arm_without_counts_is_no_part_of_the_flux():
-    """The flux of a row is the mean of those of the arms that were measured, whatever arm that is."""
+def test_an_arm_without_counts_has_no_flux_and_leaves_that_of_others():
     pairs = Cameras(("O1", "E1", "O2", "E2"), arms=((0, 1), (2, 3)), split=True)
     counts = np.array(
-        [[110.0, 90.0, 110.0, 90.0], [np.nan, 90.0, np.nan, np.nan], [110.0, 90.0, np.nan, np.nan]]
+        [[110.0, 90.0, 220.0, 180.0], [np.nan, 90.0, np.nan, np.nan], [110.0, 90.0, np.nan, np.nan]]
     )
     star = np.zeros(3, int)
     found = estimate(np.repeat(IDEAL[None], 3, axis=0), counts, np.full((3, 4), 3.0), star, pairs)
-    assert found.flux[2] == pytest.approx(found.flux[0], rel=0.02)
-    assert found.flux[1] == pytest.approx(found.flux[0], rel=0.02)
+    # N0 + N1 = F/2.
+    np.testing.assert_allclose(found.flux[0], [400.0, 400.0, 800.0, 800.0], rtol=0.01)
+    np.testing.assert_allclose(found.flux[1:], [[400.0, 400.0, 0.0, 0.0]] * 2, rtol=0.02)
+    np.testing.assert_array_equal(found.relative(np.ones((3, 4)))[1:, 2:], 0.0)

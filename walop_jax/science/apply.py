@@ -209,9 +209,8 @@ class _Application:
             gain = fitted.gain[same]
             of_plain, of_throughput = gain @ plain[same], gain @ throughput[same]
             derivative[same] = vectors.to_parameters(of_plain, of_throughput, x[same], y[same])
-        lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         for p, change in detector_slopes(vectors, counts):
-            change = np.nan_to_num(change) / lit[:, None]
+            change = fitted.relative(change)
             plain[..., p] -= change
             derivative[..., p] -= np.einsum("rik,rk->ri", fitted.gain, change)
         if self.slope.any():
@@ -385,15 +384,14 @@ class _Application:
         cameras = self.vectors.instrument.cameras.names
         parameters = [name for name, _ in self.vectors.named]
         counts = np.nan_to_num(self.counts[block.rows])
-        lit = np.where(fitted.flux > 0, fitted.flux, np.inf)
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
 
         def shift(entry: PossibleChange) -> Pairs:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
             grown, k = np.zeros_like(counts), cameras.index(entry.name)
-            grown[:, k] = check.growth.electrons(entry, *place, counts[:, k]) / lit
-            return calibration_shift(fitted.gain, grown[..., None], block.star)[..., 0]
+            grown[:, k] = check.growth.electrons(entry, *place, counts[:, k])
+            return calibration_shift(fitted.gain, fitted.relative(grown)[..., None], block.star)[..., 0]
 
         total, first = np.zeros_like(block.stars.changed), np.flatnonzero(np.diff(block.star, prepend=-1))
         for change in (*check.changes, *check.places):

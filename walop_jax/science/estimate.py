@@ -43,8 +43,9 @@ class Estimate:
     """(q, u) of every star, NaN where its rows do not hold both.
 
     `photon` is the covariance from the noise of the counts; `condition` the square root of the condition
-    number of the information (1: q and u equally well known); `chi2` and `dof` of the star's rows, `flux` (in
-    counts of unpolarised light at unit throughput) and `gain` of every row: δ(q, u) = −Σ gain · δ(model / F).
+    number of the information (1: q and u equally well known); `chi2` and `dof` of the star's rows, `flux` F (in
+    counts of unpolarised light at unit throughput) of every camera and `gain` of every row:
+    δ(q, u) = −Σ gain · δ(model / F).
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -52,8 +53,12 @@ class Estimate:
     condition: Float[np.ndarray, " s"]
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
-    flux: Float[np.ndarray, " r"]
+    flux: Counts
     gain: Float[np.ndarray, "r 2 k"]
+
+    def relative(self, change: Counts) -> Counts:
+        """Changes of counts over the flux, δ(model / F); 0 where there is no light."""
+        return np.nan_to_num(change) / np.where(self.flux > 0, self.flux, np.inf)
 
 
 def estimate(
@@ -66,8 +71,7 @@ def estimate(
     """Stokes parameters of stars from rows of intensities.
 
     A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN. Where the
-    shares of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row; the
-    flux of a row is then the mean of those of its arms.
+    shares of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row.
 
     `vectors` (row, camera, Stokes) are the analysis vectors in the frame that (q, u) are wanted in; counts that
     are not finite, or whose `sigma` is not finite and above 0, are not used. `star` numbers the stars from 0
@@ -79,8 +83,7 @@ def estimate(
         measured = np.where(mine, counts[:, None], np.nan).reshape(-1, count)
         row = np.repeat(np.arange(len(counts)), arms)
         of_arms = estimate(vectors[row], measured, sigma[row], star[row])
-        lit = np.any(np.isfinite(measured * sigma[row]) & (sigma[row] > 0), axis=1).reshape(-1, arms)
-        flux = np.sum(of_arms.flux.reshape(-1, arms), axis=1, where=lit) / np.maximum(lit.sum(axis=1), 1)
+        flux = of_arms.flux.reshape(-1, arms, count)[:, mine.argmax(axis=0), np.arange(count)]
         gain = of_arms.gain.reshape(-1, arms, 2, count).sum(axis=1)
         return dataclasses.replace(of_arms, flux=flux, gain=gain)
     used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
@@ -104,6 +107,7 @@ def estimate(
     residual = np.einsum("rk,rk->r", weight, (data - flux[:, None] * model) ** 2)
     chi2 = np.add.reduceat(residual, first)
     dof = np.add.reduceat(used.sum(axis=1) - used.any(axis=1), first) - 2
+    flux = np.repeat(flux[:, None], counts.shape[1], axis=1)
     return Estimate(qu, photon, condition, chi2, dof, flux, gain)
 
 
