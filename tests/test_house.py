@@ -204,7 +204,7 @@ MOST_LINES = {
     "fit": 2102,
     "calibration": 2661,
     "posterior": 2182,
-    "science": 5822,
+    "science": 5910,
     "diagnosis": 7943,
     "nights": 2598,
     "plans": 2219,
