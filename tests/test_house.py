@@ -204,7 +204,7 @@ MOST_LINES = {
     "fit": 2102,
     "calibration": 2661,
     "posterior": 2182,
-    "science": 5910,
+    "science": 5907,
     "diagnosis": 7943,
     "nights": 2598,
     "plans": 2219,

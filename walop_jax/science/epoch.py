@@ -350,10 +350,8 @@ def _visible(changed: Calibration) -> dict[str, float]:
     x, y = changed.raster(4)
     # Field points differ by no less than before: it is the parameters that are compared.
     verdict = dataclasses.replace(changed.verdict, structure=NO_STRUCTURE)
-    changed, name = (
-        dataclasses.replace(changed, verdict=verdict),
-        str(np.unique(changed.exposures.filter)[-1]),
-    )
+    changed = dataclasses.replace(changed, verdict=verdict)
+    name = str(np.unique(changed.exposures.filter)[-1])
     _, covariance = changed.matrix(x, y, changed.usual_settings(1, name))
     error = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
     elements = matrix_elements(len(changed.model.template.cameras.pairs))

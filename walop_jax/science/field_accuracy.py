@@ -180,9 +180,8 @@ class Requirement:
 def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: bool = True) -> Requirement:
     limit = f"{two_digits(100 * allowed)} %"
     found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
-    return Requirement(
-        f"p known to {limit} in {where}", error <= allowed, found, advice, needed
-    )  # NaN: unknown
+    # An error that is NaN is not known.
+    return Requirement(f"p known to {limit} in {where}", error <= allowed, found, advice, needed)
 
 
 def reached(error: Float[np.ndarray, "*p"]) -> float:
