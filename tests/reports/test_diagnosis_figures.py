@@ -8,9 +8,16 @@ import handmade_run
 import numpy as np
 import pytest
 from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
+from walop_jax.calibration.matrix import ResidualMap
+from walop_jax.io.errors import DataError
+from walop_jax.model.cameras import Cameras
 from walop_jax.reports import diagnosis_figures as figures
 from walop_jax.reports import figures as of_calibrations
+from walop_jax.reports.style import pixel_map, plain_ticks, point_map
+from walop_jax.science.field_accuracy import FieldAccuracy
 
 
 def tiles(figure) -> list[PatchCollection]:
@@ -93,6 +100,37 @@ def test_ladder_shows_chi2_per_degree_of_freedom():
     assert [text.get_text() for text in axis.texts] == ["1.625", "1.029"]
 
 
+def test_ladder_of_a_fit_with_few_degrees_of_freedom():
+    """5 √(2/20) > 1: the band has no lower end on a logarithmic axis."""
+    ladder = handmade_run.figure_data().ladder
+    figure = figures.ladder_figure({**ladder, "CHI2": np.array([40.0, 19.0]), "DOF": np.array([21, 20])})
+    figure.draw_without_rendering()
+    low, high = figure.axes[0].get_xlim()
+    assert 0.05 < low < 0.95
+    assert 2.5 < high < 10.0
+
+
+def test_shares_of_a_single_camera():
+    shares = handmade_run.figure_data().shares
+    rows = shares["GROUP"] != "camera"
+    figure = figures.shares_figure({name: values[rows] for name, values in shares.items()})
+    assert [axis.get_xlabel() for axis in figure.axes] == ["exposure"]
+
+
+def test_protection_levels_are_shown_where_they_are_known():
+    """A tile for each, a cross for none; of points along a line there was no map."""
+    line = np.linspace(-0.2, 0.2, 5)
+    levels = np.array([0.001, 0.002, np.nan, 0.004, 0.005])
+    causes = ("ghost",) * 5
+    found = dataclasses.replace(
+        handmade_run.limits(), x=line, y=0.0 * line, protection=levels, caused_by=causes
+    )
+    figure = figures.protection_figure(found)
+    np.testing.assert_allclose(tiles(figure)[0].get_array(), [0.1, 0.2, 0.4, 0.5])
+    (crosses,) = figure.axes[0].lines
+    assert crosses.get_xydata().tolist() == [[0.0, 0.0]]
+
+
 def test_maps_of_a_product_are_those_of_the_file():
     maps = handmade_run.product().maps
     figure = of_calibrations.matrix_maps_figure(maps)
@@ -104,3 +142,48 @@ def test_maps_of_a_product_are_those_of_the_file():
     assert len([a for a in of_calibrations.matrix_maps_figure(one_arm).axes if a.get_title()]) == 3
     errors = of_calibrations.matrix_errors_figure(maps)
     np.testing.assert_allclose(errors.axes[5].images[0].get_array(), 0.02)
+    assert errors.axes[5].images[0].get_clim() == pytest.approx((0.01, 0.1))  # decades around all errors
+    with pytest.raises(DataError, match="no element of the matrix of 1 arms is cross-talk"):
+        of_calibrations.matrix_maps_figure(one_arm, 2)
+
+
+def test_maps_of_residuals_name_the_cameras_of_each_arm():
+    """Also where no cell has enough data."""
+    grid, nothing = handmade_run.product().maps.grid, np.full((7, 5, 5), np.nan)
+    cameras = Cameras(("a", "b", "c", "d"), arms=((0, 2), (1, 3)))
+    figure = of_calibrations.residual_map_figure(
+        ResidualMap(grid, "band", nothing, nothing, nothing[0]), cameras
+    )
+    figure.draw_without_rendering()
+    assert [axis.get_title() for axis in figure.axes[:8]][3] == "b, d / a, c (%)"
+
+
+def test_the_error_of_p_of_any_goal_and_of_nothing_before():
+    accuracy = FieldAccuracy(
+        np.linspace(0.001, 0.01, 25).reshape(5, 5), (-0.2, 0.2, -0.2, 0.2), "r", goal=1e-5
+    )
+    right = of_calibrations.accuracy_figure(accuracy).axes[1]
+    low, high = right.get_xlim()
+    assert low < 0.001 < high  # the goal, in per cent
+    field = {"x": [0.0, 0.1], "y": [0.0, 0.0], "before": [None, None], "p_error": [0.001, None]}
+    figure = of_calibrations.planned_figure(field)
+    assert [shown.get_array().tolist() for shown in tiles(figure)] == [[], [0.1]]
+
+
+def test_a_single_point_has_a_tile():
+    axis = Figure().subplots()
+    zero = np.zeros(1)
+    point_map(axis, "", zero, zero, zero, Normalize(0.0, 1.0), "viridis")
+    assert axis.get_xlim() == pytest.approx((-0.03, 0.03), abs=0.006)
+    image = pixel_map(axis, "", np.zeros((1, 1)), (0.0, 0.0, 0.0, 0.0), Normalize(0.0, 1.0), "viridis")
+    assert image.get_extent() == pytest.approx((-0.025, 0.025, -0.025, 0.025))
+
+
+@pytest.mark.parametrize("ends", [(0.1, 0.4), (1.0, 4.0), (0.001, 10.0)])
+def test_ticks_are_labelled_with_their_numbers(ends):
+    axis = Figure().subplots()
+    axis.set(xscale="log", xlim=ends)
+    plain_ticks(axis.xaxis)
+    ticks = axis.get_xticks()
+    assert len(ticks) >= 4
+    assert [float(text.get_text()) for text in axis.get_xticklabels()] == pytest.approx(ticks)

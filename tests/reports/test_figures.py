@@ -15,6 +15,9 @@ import walop_jax as walop
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis.figure_data import figure_data
 from walop_jax.diagnosis.findings import Diagnosis
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.cameras import Cameras
 from walop_jax.reports import figures
 from walop_jax.reports.diagnosis_figures import signature_figure
 
@@ -37,6 +40,15 @@ def test_residuals_of_points_are_noise_after_a_fit(fitted):
     assert after.shape == (25 + 4,)
     assert np.sqrt(np.nanmean(after**2)) == pytest.approx(1.0, abs=0.15)
     assert figures.point_residuals(result.likelihood, result.model.start).min() > 5.0
+
+
+def test_the_histogram_is_as_high_as_its_bars(fitted, monkeypatch):
+    """Of residuals far smaller than noise: errors that were stated too large."""
+    result, whole = fitted[0], Likelihood.residuals
+    monkeypatch.setattr(Likelihood, "residuals", lambda self, v: (None, 0.1 * whole(self, v)[1]))
+    figure = figures.residuals_figure(result.likelihood, result.values, result.model.start)
+    (axis,) = (axis for axis in figure.axes if axis.get_ylabel() == "density")
+    assert axis.get_ylim()[1] > max(bar.get_height() for bar in axis.patches) > 1.0
 
 
 def test_every_figure_can_be_drawn(fitted):
@@ -95,6 +107,7 @@ def test_figures_go_into_axes_and_hold_fonts_that_journals_take(fitted):
     inside = walop.plot(calibration, "efficiency", ax=right)
     assert inside in whole.subfigs
     assert len([axis for axis in inside.axes if axis.images]) == 2
+    assert len(walop.plot(fitted[0], "modulation", ax=whole.subplots()).axes) == 2
     pyplot.close(whole)
     figure = walop.plot(calibration, "matrix", figsize=(3.5, 2.6))
     assert tuple(figure.get_size_inches()) == (3.5, 2.6)
@@ -117,6 +130,27 @@ def test_modulation_is_that_of_the_data(fitted):
     for axis, pair in zip(figure.axes, (0, 2), strict=True):
         shown = axis.lines[1].get_ydata()
         np.testing.assert_allclose(shown, (n[:, pair] - n[:, pair + 1]) / (n[:, pair] + n[:, pair + 1]))
+
+
+def test_modulation_is_that_of_the_cameras_of_an_arm(fitted):
+    """Whatever their order in the set; a single camera has none."""
+    calset = fitted[0].calset
+    names = ("a", "b", "c", "d")
+    figure = figures.modulation_figure(calset, [3], cameras=Cameras(names, arms=((2, 0), (1, 3))))
+    n = calset.intensities.block(3, 4).counts[0, calset.exposures.clp_in]
+    for axis, (i, j) in zip(figure.axes, ((2, 0), (1, 3)), strict=True):
+        np.testing.assert_allclose(axis.lines[1].get_ydata(), (n[:, i] - n[:, j]) / (n[:, i] + n[:, j]))
+    one_arm = figures.modulation_figure(calset, [3], cameras=Cameras(names, arms=((2, 0), (1,), (3,))))
+    assert [axis.get_ylabel() for axis in one_arm.axes] == ["(c − a) / (c + a)"]
+    with pytest.raises(DataError, match="no arm has two cameras"):
+        figures.modulation_figure(calset, [3], cameras=Cameras(names, arms=((0,), (1,), (2,), (3,))))
+
+
+def test_a_calibration_in_memory_lists_what_can_be_drawn_without_its_data(fitted):
+    result, calibration = fitted
+    of_data = {"calibration", "coefficients", "transmission", "modulation", "residuals"}
+    assert {*walop.plot(result)} - {*walop.plot(calibration)} == of_data
+    assert "residual-map" not in walop.plot(calibration)
 
 
 def test_figures_of_a_diagnosis_hold_its_residuals(fitted):

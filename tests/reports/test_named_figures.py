@@ -132,8 +132,9 @@ def test_figures_of_a_diagnosis(tmp_path):
     assert rows == [["without", "clp_wobble"], ["clp_wobble"], ["with", "clp_wobble"]]
     whole = draw("effect", dataclasses.replace(run, step=0))
     assert whole.axes[0].get_ylabel().splitlines()[:2] == ["starting", "model"]
-    with pytest.raises(DataError, match=r"step 2: the diagnosis added 1 effect; step 0"):
-        plot(tmp_path, "signature", step=2)
+    for step in (2, -1):
+        with pytest.raises(DataError, match=rf"step {step}: the diagnosis added 1 effect; step 0"):
+            plot(tmp_path, "signature", step=step)
 
 
 def test_names_and_files(source, tmp_path):
@@ -272,6 +273,7 @@ def test_plates_are_found_by_their_class(tmp_path):
     write_calibration(tmp_path / "calibration.fits", calibration)
     listed = possible(FigureSource(Run(tmp_path)))
     assert listed["retardance"] == "maps of the retardance of main.plate"
+    assert not {"accuracy", "cross-talk"} & {*listed}  # of a single arm
 
 
 @pytest.mark.parametrize("dark", [{"axes.facecolor": "black", "text.color": "white", "font.size": 25.0}])

@@ -76,5 +76,8 @@ def test_a_corner_plot_shows_what_is_correlated():
     assert len(shown) == MOST_IN_CORNER
     assert {"p2", "p7", "p9"} < set(shown)
     assert list(shown) == sorted(shown)
+    # That of one which never moved is no correlation.
+    draws[:, 4] = 0.0
+    assert "p4" not in correlated(draws, names, {})
     # Pictures of a prior are left out, however correlated they are.
     assert "p2" not in correlated(draws, names, {"p2": 1.0})

@@ -204,6 +204,8 @@ def test_the_figure_shows_every_night(row):
     figure = quality_figure(table, read_limits())
     assert len(figure.axes) == 6
     assert figure.axes[0].get_xlim()[1] > 61224.0 - 40587  # days since 1970
+    undated = judge(table_of_nights([night(row, k, NIGHT=np.nan) for k in range(2)]), read_limits())
+    quality_figure(undated, read_limits()).draw_without_rendering()
 
 
 def test_a_run_from_disk_and_one_in_memory_give_one_row(tmp_path: Path):

@@ -48,12 +48,14 @@ def residual_maps(
     norm, colours = (Normalize(0.5, far), "magma_r") if rms else (Normalize(-far, far), style.DIVERGING)
     signs = not rms and len(points) <= MOST_MARKED
     size, grid = (0.6 + 2.0 * len(cameras), 0.55 + 1.75 * len(maps)), (len(maps), len(cameras))
-    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, squeeze=False, least=0.8, labels=0.4)
+    figure, axes = on.panels(*size, *grid, sharex=True, sharey=True, least=0.8, labels=0.4)
     tiles: Any = None
-    for number, values in enumerate(maps.values()):
+    for number, (name, values) in enumerate(maps.items()):
         for k, axis in enumerate(axes[number]):
             title = cameras[k] if number == 0 else ""
             tiles = style.point_map(axis, title, points.x, points.y, values[:, k], norm, colours, shown)
+            if axis.get_ylabel():  # on the left edge
+                axis.set_ylabel(f"{name}\n\nY (deg)")
             axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 4, 5, 10], prune="both"))
             if on.width is not None:
                 axis.tick_params(axis="x", labelrotation=90)
@@ -62,13 +64,8 @@ def residual_maps(
                 ink = "white" if abs(norm(values[i, k]) - 0.5) > 0.35 else "0.25"
                 look = {"color": ink, "fontsize": 5, "ha": "center", "va": "center"}
                 axis.text(points.x[i], points.y[i], "+" if values[i, k] > 0 else "−", **look)
-    style.outer_labels(axes)
-    for row, title in zip(axes, maps, strict=True):
-        for axis in row:
-            if axis.get_subplotspec().is_first_col():
-                axis.set_ylabel(f"{title}\n\nY (deg)")
     label = "rms residual (σ)" if rms else "residual (σ)"
-    style.colour_bar(figure, tiles, axes, label, pad=0.015, aspect=18 * len(maps), fraction=0.03)
+    style.colour_bar(tiles, label, axes, pad=0.015, aspect=18 * len(maps), fraction=0.03)
     return figure
 
 
@@ -110,7 +107,7 @@ def signature_figure(
     residuals.
     """
     angular, position, label = _abscissa(comparison, exposures)
-    grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1), "squeeze": False}
+    grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1)}
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
     for k, camera in enumerate(cameras):
         finite = np.isfinite(position) & np.isfinite(comparison.curves["BEFORE"][:, k])
@@ -124,7 +121,7 @@ def signature_figure(
         upper[k].set_title(camera)
         lower[k].set_xlabel(label)
         if angular:
-            style.angle_ticks(lower[k].xaxis, figure, lower[k].get_subplotspec().get_gridspec().ncols)
+            style.angle_ticks(lower[k])
     upper[0].set_ylabel("residual (σ)")
     lower[0].set_ylabel("remaining (σ)")
     figure.legend(*upper[0].get_legend_handles_labels(), frameon=False, ncols=2, loc=style.ABOVE)
@@ -170,7 +167,7 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
     explains = ratio < 1.0 + width
     for chosen, marker, colour in ((~explains, "o", style.BEFORE), (explains, "s", style.AFTER)):
         axis.plot(ratio[chosen], place[chosen], marker, color=colour, ms=7, lw=0, zorder=3)
-    low, high = min(float(ratio.min()), 1.0 - width), max(float(ratio.max()), 1.0 + width)
+    low, high = min(float(ratio.min()), max(1.0 - width, 0.1)), max(float(ratio.max()), 1.0 + width)
     margin = (high / low) ** 0.12
     axis.set(xscale="log", xlim=(low / margin, high * margin**2), xlabel="χ² per degree of freedom")
     for y, value in zip(place, ratio, strict=True):
@@ -178,7 +175,6 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
         axis.annotate(f"{value:.4g}", (value, y), fontsize=8, **place_of_text)
     axis.set_yticks(place, names)
     axis.set_ylim(len(ratio) - 0.5, -0.5)
-    axis.tick_params(labelsize=style.SMALL)
     style.plain_ticks(axis.xaxis)
     for side in ("top", "right", "left"):
         axis.spines[side].set_visible(False)
@@ -192,7 +188,7 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
     widths = [float(np.count_nonzero(shares["GROUP"] == g) + 1) for g in groups]
     widths.append(max(12.0, sum(widths)))
-    figure, axes = on.panels(8.6, 2.7, 1, len(widths), width_ratios=widths, sharey=True)
+    figure, (axes,) = on.panels(8.6, 2.7, 1, len(widths), width_ratios=widths, sharey=True)
     before, after = (shares[when] / np.maximum(shares["EXPECTED"], 1e-300) for when in ("BEFORE", "AFTER"))
     for axis, group in zip(axes, [*groups, "exposure"], strict=True):
         rows = np.flatnonzero(shares["GROUP"] == group)
@@ -219,39 +215,23 @@ def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
     return figure
 
 
-_PIXELS = 121
 _STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 
 @styled
 def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     """Largest error of q and u by a single effect that goes undetected; crosses: not both in one exposure."""
-    from scipy.interpolate import griddata
-    from scipy.spatial import KDTree  # takes a tenth of a second, and this figure alone needs it
-
     figure, axis = on.single(5.0, 3.8)
-    good = np.isfinite(found.protection)
-    if not good.any():
+    percent = 100.0 * found.protection
+    if found.worst is None:
         axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
-    percent = 100 * found.protection
-    norm = LogNorm(np.nanmin(percent), max(np.nanmax(percent), 1.2 * np.nanmin(percent)))
-    # Standards lie between the other points: in between the level is interpolated, where one of these is known.
-    field = (found.x.min(), found.x.max(), found.y.min(), found.y.max())
-    lines = np.linspace(*field[:2], _PIXELS), np.linspace(*field[2:], _PIXELS)
-    places = np.stack(np.meshgrid(*lines), axis=-1)
-    points = np.stack([found.x, found.y], axis=1)
-    level = np.full((_PIXELS,) * 2, np.nan)
-    if good.sum() > 3:
-        level = griddata(points[good], np.log(percent[good]), places)
-    nearest = KDTree(points).query(places)[1]
-    level = np.where(np.isnan(level), np.log(percent[nearest]), level)
-    title, values = "largest error that goes undetected", np.where(good[nearest], np.exp(level), np.nan)
-    shown = style.pixel_map(axis, title, values, field, norm, style.SEQUENTIAL)
-    style.colour_bar(figure, shown, axis, "error of q, u (%)")
-    axis.plot(found.x[~good], found.y[~good], "x", color="0.5", ms=4, label="u not measured in one exposure")
-    if not good.all():
+    least, largest = float(np.nanmin(percent)), float(np.nanmax(percent))
+    norm = LogNorm(least, max(largest, 1.2 * least))
+    shown = style.error_map(axis, "largest error that goes undetected", found.x, found.y, percent, norm)
+    style.colour_bar(shown, "error of q, u (%)")
+    if np.isnan(percent).any():
         figure.legend(frameon=False, loc=style.ABOVE)
     return figure
 
@@ -280,7 +260,7 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
         axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all")
     label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
     if narrow:
-        style.colour_bar(figure, shown, [axis], label, location="bottom", aspect=30)
+        style.colour_bar(shown, label, axis, location="bottom", aspect=30)
     else:
-        style.colour_bar(figure, shown, axis, label)
+        style.colour_bar(shown, label)
     return figure

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
+from walop_jax.model.cameras import Cameras
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
 from walop_jax.reports import diagnosis_figures as diagnosis
 from walop_jax.reports import figures, posterior_figures, survey_figures
 from walop_jax.reports import paper_figures as paper
 from walop_jax.reports.run import COMPARISON, DATA, SURVEY, FigureSource
-from walop_jax.reports.style import PAGE, PLATES, AnyFigure, texts
+from walop_jax.reports.style import NARROW, PAGE, PLATES, AnyFigure, texts
 from walop_jax.reports.wording import listed as in_words
-
-NARROW = 5.0  # inches of a corner plot: three coefficients at most
 
 
 def _accuracy(source: FigureSource) -> AnyFigure:
     accuracy = source.accuracy
     if accuracy is None:
-        advice = "plot matrix-errors"
-        raise fail("has a single arm: one exposure holds no p", file=source.folder, advice=advice)
+        what = f"the error of p is that of one exposure of two arms, and there are {source.maps.arms}"
+        raise fail(what, file=source.folder, advice="plot matrix-errors")
     return figures.accuracy_figure(accuracy, source.canvas)
 
 
@@ -42,53 +42,47 @@ def _residual_map(source: FigureSource) -> AnyFigure:
     if source.stored.residuals is None:
         advice = "it comes with sets of whole frames"
         raise fail("holds no map of residuals", file=source.folder, advice=advice)
-    cameras = source.rebuilt.model.template.cameras.names
-    return figures.residual_map_figure(source.stored.residuals, cameras, source.canvas)
+    return figures.residual_map_figure(source.stored.residuals, source.stored.design.cameras, source.canvas)
 
 
-def _draws(source: FigureSource) -> tuple[dict[str, Any], dict[str, str], tuple[str, ...]]:
-    """Draws (chain, draw) and units by name, and the names that are shown."""
+def _draws(source: FigureSource) -> tuple[Float[np.ndarray, "c d k"], tuple[str, ...], list[str]]:
+    """Draws of the coefficients that are shown, their names and units."""
     if source.posterior is None:
         raise fail("has no posterior", file=source.folder, advice="run walop-jax sample first")
     data = source.posterior["posterior"]
-    held = {str(name): np.asarray(data[name].values) for name in data.data_vars}
-    units = {name: str(data[name].attrs.get("units", "")) for name in held}
-    units = {name: "" if unit == "1" else unit for name, unit in units.items()}
     for name in source.parameters:
-        if name not in held:
-            path = source.folder / POSTERIOR
+        if name not in data.data_vars:
+            path, held = source.folder / POSTERIOR, [*map(str, data.data_vars)]
             raise fail(f"has no coefficient {name!r}", file=path, advice=nearest(name, held))
-    sampled = tuple(name for name in held if "sampled_by" in data[name].attrs)
-    if source.sample is not None:
-        sampled = source.sample.sampled
-    return held, units, source.parameters or sampled
+    sampled = tuple(str(name) for name in data.data_vars if "sampled_by" in data[name].attrs)
+    sampled = sampled if source.sample is None else source.sample.sampled
+    shown = source.parameters or sampled
+    units = [str(data[name].attrs.get("units", "1")) for name in shown]
+    draws = np.stack([data[name].values for name in shown], axis=-1)
+    return draws, shown, ["" if unit == "1" else unit for unit in units]
 
 
 def _corner(source: FigureSource) -> AnyFigure:
-    held, units, shown = _draws(source)
-    if not source.parameters:
-        draws = np.stack([held[name].ravel() for name in shown], axis=1)
-        narrow = source.canvas.width is not None and source.canvas.width < NARROW
-        limit = 3 if narrow else posterior_figures.MOST_IN_CORNER
-        shown = posterior_figures.correlated(draws, shown, source.prior_width, limit)
     if source.canvas.ax is not None:
         raise ValueError("ax: a corner plot needs a figure of its own")
-    draws = np.stack([held[name].ravel() for name in shown], axis=1)
-    size = source.canvas.width or (source.canvas.figsize or (posterior_figures.CORNER,))[0]
-    in_units = [units[name] for name in shown]
-    return posterior_figures.corner_figure(draws, shown, in_units, source.reference, size)
+    draws, shown, units = _draws(source)
+    draws, width = draws.reshape(-1, len(shown)), source.canvas.width
+    if not source.parameters:
+        most = posterior_figures.MOST_IN_CORNER if width is None or width >= NARROW else 3
+        chosen = posterior_figures.correlated(draws, shown, source.prior_width, most)
+        column = [shown.index(name) for name in chosen]
+        draws, shown, units = draws[:, column], chosen, [units[k] for k in column]
+    size = width or (source.canvas.figsize or (posterior_figures.CORNER,))[0]
+    return posterior_figures.corner_figure(draws, shown, units, source.reference, size)
 
 
 def _trace(source: FigureSource) -> AnyFigure:
-    held, units, shown = _draws(source)
-    chains = np.stack([held[name][:, :, None] for name in shown], axis=-1)
-    steps, tau = 1, np.full(len(shown), np.nan)
-    sample = source.sample
+    draws, shown, units = _draws(source)
+    chains, steps, tau, sample = draws[:, :, None], None, np.full(len(shown), np.nan), source.sample
     if sample is not None and set(shown) <= set(sample.sampled):  # the walkers, not the draws
         column = [sample.sampled.index(name) for name in shown]
         chains, steps, tau = sample.chains[..., column], sample.thin, sample.convergence.tau[column]
-    in_units = [units[name] for name in shown]
-    return posterior_figures.trace_figure(chains, shown, in_units, steps, tau, source.canvas)
+    return posterior_figures.trace_figure(chains, shown, units, steps, tau, source.canvas)
 
 
 def _signature(source: FigureSource) -> AnyFigure:
@@ -97,9 +91,9 @@ def _signature(source: FigureSource) -> AnyFigure:
     return diagnosis.signature_figure(*shown, source.canvas)
 
 
-def _cameras(source: FigureSource) -> tuple[str, ...] | None:
-    """Their names, of which the product of an instrument of one's own knows."""
-    return None if source.product is None else source.product.design.cameras.names
+def _cameras(source: FigureSource) -> Cameras | None:
+    """Those of an instrument, which the product knows; None without one."""
+    return None if source.product is None else source.product.design.cameras
 
 
 def _modulation(source: FigureSource) -> AnyFigure:
@@ -123,10 +117,8 @@ class NamedFigure(NamedTuple):
 
 
 def _small(source: FigureSource) -> bool:
-    """True where the run names its data, a set of points: a survey does not, whole frames have a map of residuals."""
-    run = source.run
-    named = run is None or bool(run.data or (run.product and run.product.inputs))
-    return source.stored.residuals is None and named
+    """True where there are the data of the fit, a set of points; those of whole frames have a map of residuals."""
+    return DATA in source and (source.product is None or source.product.residuals is None)
 
 
 def _plates(source: FigureSource) -> list[str]:
@@ -138,21 +130,26 @@ def _angles(fewest: int) -> Callable[[FigureSource], bool]:
     """True where a filter was seen at so many polariser angles, the calibration plate out."""
 
     def enough(source: FigureSource) -> bool:
-        e = source.stored.exposures
-        rows = e.clp_in & ~e.position(CALIBRATION_PLATE).inside & (e.filter == source.maps.filter)
+        product = source.product
+        e = source.calset.exposures if product is None else product.exposures
+        rows = e.clp_in & ~e.position(CALIBRATION_PLATE).inside
+        if product is not None:
+            rows = rows & (e.filter == product.maps.filter)
         return _small(source) and len(np.unique(np.round(e.clp_angle[rows] % 180.0, 6))) >= fewest
 
     return enough
 
 
 FIGURES: Mapping[str, NamedFigure] = {
-    "accuracy": NamedFigure(_accuracy, possible=lambda s: s.maps.arms > 1),
+    "accuracy": NamedFigure(_accuracy, possible=lambda s: s.maps.arms == 2),
     "calibration": NamedFigure(lambda s: _residuals(s, whole=True), possible=_small),
     "matrix": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, on=s.canvas)),
     "matrix-errors": NamedFigure(lambda s: figures.matrix_errors_figure(s.maps, s.canvas)),
     "zero-offset": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 0, s.canvas)),
     "efficiency": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 1, s.canvas)),
-    "cross-talk": NamedFigure(lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas)),
+    "cross-talk": NamedFigure(
+        lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas), possible=lambda s: s.maps.arms == 2
+    ),
     "retardance": NamedFigure(lambda s: paper.retardance_figure(s.rebuilt, s.canvas), possible=_plates),
     "retardance-wavelength": NamedFigure(
         lambda s: paper.retardance_wavelength_figure(s.rebuilt, s.canvas), possible=_plates
@@ -164,7 +161,7 @@ FIGURES: Mapping[str, NamedFigure] = {
         lambda s: paper.transmission_figure(s.calset, s.maps.filter, s.place, s.canvas, _cameras(s)),
         possible=_angles(3),
     ),
-    "modulation": NamedFigure(_modulation, possible=_angles(1)),
+    "modulation": NamedFigure(_modulation, DATA, _angles(1)),
     "protection": NamedFigure(lambda s: diagnosis.protection_figure(s.limits, s.canvas), LIMITS),
     "separation": NamedFigure(lambda s: diagnosis.separation_figure(s.limits, s.canvas), LIMITS),
     "ladder": NamedFigure(lambda s: diagnosis.ladder_figure(s.figure_data.ladder, s.canvas), FIGURE_DATA),
@@ -174,7 +171,7 @@ FIGURES: Mapping[str, NamedFigure] = {
     "signature": NamedFigure(_signature, FIGURE_DATA),
     "rms": NamedFigure(lambda s: diagnosis.rms_figure(s.figure_data, s.canvas), FIGURE_DATA),
     "shares": NamedFigure(lambda s: diagnosis.shares_figure(s.figure_data.shares, s.canvas), FIGURE_DATA),
-    "residual-map": NamedFigure(_residual_map, possible=lambda s: not _small(s)),
+    "residual-map": NamedFigure(_residual_map, possible=lambda s: s.stored.residuals is not None),
     "residuals": NamedFigure(_residuals, possible=_small),
     "corner": NamedFigure(_corner, POSTERIOR),
     "trace": NamedFigure(_trace, POSTERIOR),
@@ -191,7 +188,6 @@ def _tracks(source: FigureSource) -> AnyFigure:
 
 
 OF_RESULTS: Mapping[str, NamedFigure] = {
-    "modulation": NamedFigure(_modulation, DATA, lambda s: bool(s.calset.exposures.clp_in.any())),
     "histogram": NamedFigure(lambda s: paper.histogram_figure(s.held[COMPARISON]), COMPARISON),
     "map": NamedFigure(lambda s: paper.map_figure(s.held[COMPARISON]), COMPARISON),
     "offset": NamedFigure(lambda s: paper.offset_figure(s.held[COMPARISON]), COMPARISON),
@@ -209,8 +205,7 @@ OF_RESULTS: Mapping[str, NamedFigure] = {
 def possible(source: FigureSource) -> dict[str, str]:
     """The figures that a run, or a result in memory, can give, with a line about each; its plates by their names."""
     every = FIGURES if source.run is not None else {**FIGURES, **OF_RESULTS}
-    in_source = {name: entry for name, entry in every.items() if entry.needs in source}
-    listed = {name: texts("figures")[name] for name, entry in in_source.items() if entry.possible(source)}
+    listed = {n: texts("figures")[n] for n, f in every.items() if f.needs in source and f.possible(source)}
     if "retardance" in listed:
         listed["retardance"] = f"maps of the retardance of {in_words(_plates(source))}"
     return listed
@@ -218,11 +213,11 @@ def possible(source: FigureSource) -> dict[str, str]:
 
 def draw(name: str, source: FigureSource) -> AnyFigure:
     """The figure of a name; `DataError` with the nearest names if there is none, or if the run lacks its data."""
-    if name not in FIGURES and name in OF_RESULTS and OF_RESULTS[name].needs in source:
-        if source.canvas != PAGE:
-            raise ValueError(f"the figure {name!r} has a size of its own: leave ax, figsize and width out")
-        return OF_RESULTS[name].draw(source)
-    if name not in FIGURES:
+    if name in FIGURES:
+        return FIGURES[name].draw(source)
+    if name not in OF_RESULTS or OF_RESULTS[name].needs not in source:
         advice = f"{nearest(name, FIGURES)} (walop-jax plot RUN lists all)"
         raise fail(f"there is no figure {name!r}", advice=advice)
-    return FIGURES[name].draw(source)
+    if source.canvas != PAGE:
+        raise ValueError(f"the figure {name!r} has a size of its own: leave ax, figsize and width out")
+    return OF_RESULTS[name].draw(source)

@@ -18,15 +18,15 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import with_minus_sign
+from walop_jax.model.cameras import Cameras
 from walop_jax.model.instrument import Instrument
 from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances
 from walop_jax.reports import style
-from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, Places, styled
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
-Places = Float[np.ndarray, " p"]
 _PIXELS, _LINES = 31, 41
 _STEPS = 21  # from the centre of the field to its edge
 _WAVELENGTH, _WAVELENGTHS = 0.62, (0.5, 0.75)  # µm
@@ -39,8 +39,8 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
     instrument = calibration.model.instrument(calibration.values)
     names = plate_names(instrument)
     retardances = plate_retardances(instrument, np.array([_WAVELENGTH]), *calibration.raster(_PIXELS))[..., 0]
-    figure, axes = on.panels(3.9 * len(names), 3.3, 1, len(names), squeeze=False)
-    for name, axis, values in zip(names, axes[0], retardances, strict=True):
+    figure, (axes,) = on.panels(3.9 * len(names), 3.3, 1, len(names), maps=True)
+    for name, axis, values in zip(names, axes, retardances, strict=True):
         # Unwrapped: a map that jumps by 360° would show the jump and nothing else.
         along = np.unwrap(values.reshape(_PIXELS, _PIXELS), axis=1, period=360.0)
         smooth = np.unwrap(along, axis=0, period=360.0)
@@ -48,11 +48,10 @@ def retardance_figure(calibration: Calibration, on: Canvas = PAGE) -> AnyFigure:
         title = f"{style.PLATES.get(name, name)} at {1e3 * _WAVELENGTH:.0f} nm"
         norm = Normalize(float(smooth.min()), float(smooth.max()))
         image = style.pixel_map(axis, title, smooth, calibration.field, norm, style.SEQUENTIAL)
-        style.colour_bar(figure, image, axis, "retardance (deg)" if axis is axes[0, -1] else "")
+        style.colour_bar(image, "retardance (deg)" if axis is axes[-1] else "")
         look = {"colors": "w", "linewidths": 0.5, "negative_linestyles": "solid"}
         lines = axis.contour(smooth, extent=calibration.field, levels=6, **look)
         axis.clabel(lines, fontsize=style.SMALL - 1, fmt=lambda value: with_minus_sign(f"{value:.0f}"))
-    style.outer_labels(axes)
     return figure
 
 
@@ -68,14 +67,14 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
     places |= {with_minus_sign(f"Y = {y:+.2f}°"): (0.0, y) for y in (low_y, high_y)}
     x, y = (np.array(values) for values in zip(*places.values(), strict=True))
     retardances = _unwrapped_retardances(instrument, line, x, y)
-    figure, axes = on.panels(3.9 * len(names), 3.5, 1, len(names), squeeze=False)
-    for name, axis, curves in zip(names, axes[0], retardances, strict=True):
+    figure, (axes,) = on.panels(3.9 * len(names), 3.5, 1, len(names))
+    for name, axis, curves in zip(names, axes, retardances, strict=True):
         for n, (place, curve) in enumerate(zip(places, curves, strict=True)):
             dashes = ("-", "--", "-.", ":", (0, (4, 4)))[n]
             axis.plot(1e3 * line, curve, linestyle=dashes, color=f"C{n}", lw=1.3, label=place)
         axis.set(title=style.PLATES.get(name, name), xlabel="wavelength (nm)")
-    axes[0, 0].set_ylabel("retardance (deg)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, ncols=3, loc=style.ABOVE)
+    axes[0].set_ylabel("retardance (deg)")
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=3, loc=style.ABOVE)
     return figure
 
 
@@ -103,7 +102,7 @@ def _unwrapped_retardances(
 def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = PAGE) -> AnyFigure:
     """Maps of the ten coefficients of the method of Paper II, a row for q and one for u."""
     fits = fit_paper(calset, filter_name)
-    figure, axes = on.panels(10.6, 4.3, 2, 5, turned=True)
+    figure, axes = on.panels(10.6, 4.3, 2, 5, maps=True)
     for row, quantity, coefficients in zip(axes, "qu", np.moveaxis(fits.coefficients, 1, 0), strict=True):
         for axis, name, values in zip(row, COEFFICIENTS, coefficients.T, strict=True):
             title = f"{quantity}, {name}{'' if name == COEFFICIENTS[0] else ' term'}"
@@ -116,8 +115,7 @@ def coefficients_figure(calset: CalibrationSet, filter_name: str, on: Canvas = P
                 low, high = -max(-low, high), max(-low, high)
             colours = style.DIVERGING if both_signs else style.SEQUENTIAL
             shown = style.point_map(axis, title, fits.x, fits.y, values, Normalize(low, high), colours)
-            style.colour_bar(figure, shown, axis, extend="both")
-    style.outer_labels(axes)
+            style.colour_bar(shown, extend="both")
     return figure
 
 
@@ -127,7 +125,7 @@ def transmission_figure(
     filter_name: str,
     place: tuple[float, float] = (0.0, 0.0),
     on: Canvas = PAGE,
-    names: Sequence[str] | None = None,
+    cameras: Cameras | None = None,
 ) -> AnyFigure:
     """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
@@ -148,8 +146,8 @@ def transmission_figure(
     model = fit_transmissions(counts[None], polariser_states(angle))
     fine = np.linspace(angle.min(), angle.max(), 181)
     fitted, curve = (transmitted(model, polariser_states(angles))[0] for angles in (angle, fine))
-    names = names or instrument_of(calset).cameras.names
-    figure, (above, below) = on.panels(6.6, 4.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    names = (cameras or instrument_of(calset).cameras).names
+    figure, ((above,), (below,)) = on.panels(6.6, 4.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     for k in range(counts.shape[1]):
         above.plot(fine, curve[:, k] / curve.sum(axis=1), color=f"C{k}", lw=1.0)
         above.plot(angle, counts[:, k] / total[:, 0], "osD^"[k % 4], color=f"C{k}", ms=4, label=names[k])
@@ -162,7 +160,7 @@ def transmission_figure(
     above.set_ylabel("share of the light")
     below.set(xlabel="polariser angle (deg)", ylabel="residual (%)")
     figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=style.ABOVE)
-    style.angle_ticks(below.xaxis, figure, 1)
+    style.angle_ticks(below)
     return figure
 
 
@@ -184,7 +182,7 @@ def histogram_figure(comparison: Comparison) -> Figure:
             for method in ("paper", "joint"):
                 values = np.clip(100 * getattr(place, method)[:, k], *_RANGE)
                 axis.hist(values, bins, histtype="step", color=_COLOURS[method], label=_NAMES[method], lw=1.5)
-            axis.axvline(100 * GOAL, color="0.5", lw=0.8, ls=":", label="goal 0.1 %")
+            axis.axvline(100 * GOAL, color="0.5", lw=0.8, ls=":", label=f"goal {100 * GOAL:g} %")
             axis.set(xscale="log", title=f"{QUANTITIES[k]}, {title}")
             style.plain_ticks(axis.xaxis)
         row[0].set_ylabel("field points")
@@ -206,8 +204,7 @@ def map_figure(comparison: Comparison) -> Figure:
             title = f"{QUANTITIES[k]}, {_NAMES[method].partition(',')[0]}, {where}"
             percent = 100 * getattr(place, method)[:, k]
             shown = style.point_map(axis, title, place.x, place.y, percent, norm, style.SEQUENTIAL)
-    style.outer_labels(axes)
-    style.colour_bar(figure, shown, axes, "rms error (%)", pad=0.01, shrink=0.8, extend="both")
+    style.colour_bar(shown, "rms error (%)", axes, pad=0.01, shrink=0.8, extend="both")
     return figure
 
 
@@ -215,7 +212,7 @@ def map_figure(comparison: Comparison) -> Figure:
 def offset_figure(comparison: Comparison) -> Figure:
     """Δq and Δu: against those of the weakest direction of the design matrix, and with one exposure more."""
     offsets = comparison.offsets
-    figure, (left, middle, right) = PAGE.panels(9.6, 3.2, 1, 3)
+    figure, ((left, middle, right),) = PAGE.panels(9.6, 3.2, 1, 3)
     for axis, c, name in ((left, 0, "q"), (middle, 1, "u")):
         of_both = (offsets.along, "one", "tab:orange"), (offsets.along_three, "three", "tab:blue")
         for along, label, color in of_both:
@@ -238,7 +235,7 @@ def offset_figure(comparison: Comparison) -> Figure:
 @styled
 def spectral_figure(comparison: Comparison) -> Figure:
     """Efficiencies and cross-talk across the filter at the extreme point; Δq_m, Δu_m of stars of four colours."""
-    figure, (left, right) = PAGE.panels(9.6, 3.2, 1, 2)
+    figure, ((left, right),) = PAGE.panels(9.6, 3.2, 1, 2)
     lines = comparison.lines
     for column, label in ((2, "$m_{22}$: q to q"), (6, "$m_{33}$: u to u"), (5, "$m_{32}$: q to u")):
         left.plot(1000 * lines[:, 0], lines[:, column], label=label, lw=1.2)
@@ -267,12 +264,11 @@ def plate_figure(
     analysis = AnalysisVectors(calibration)
     x, y = calibration.raster(_PLATE_PIXELS)
     count, norm, shown = len(combinations), LogNorm(1.0, 100.0), None
-    figure, axes = PAGE.panels(2.6 * count + 0.9, 2.9, 1, count, sharey=True, squeeze=False)
-    for axis, plates in zip(axes[0], combinations, strict=True):
+    figure, (axes,) = PAGE.panels(2.6 * count + 0.9, 2.9, 1, count, sharey=True)
+    for axis, plates in zip(axes, combinations, strict=True):
         settings = [Settings.default(1).at(CHWP=plate) for plate in plates]
         worst = plate_errors(analysis, settings, x, y).reshape(_PLATE_PIXELS, _PLATE_PIXELS)
         title = "plate " + " and ".join("out" if plate is None else f"{plate:g}°" for plate in plates)
         shown = style.pixel_map(axis, title, np.clip(worst, 1.0, 100.0), calibration.field, norm, "magma_r")
-    style.outer_labels(axes)
-    style.colour_bar(figure, shown, axes, "error / ideal instrument", pad=0.02)
+    style.colour_bar(shown, "error / ideal instrument", axes, pad=0.02)
     return figure

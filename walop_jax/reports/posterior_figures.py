@@ -40,8 +40,7 @@ def informed(
     names: Sequence[str], spread: Mapping[str, float], prior: Mapping[str, float]
 ) -> tuple[str, ...]:
     """Names that the data constrain, best first: `spread` (posterior) below that of the `prior` (NaN: none)."""
-    with_prior = {name for name in names if np.isfinite(prior.get(name, np.nan))}
-    share = {name: spread[name] / prior[name] if name in with_prior else 0.0 for name in names}
+    share = {name: np.nan_to_num(spread[name] / prior.get(name, np.nan)) for name in names}
     return tuple(sorted((n for n in names if share[n] < PRIOR_ONLY), key=lambda n: share[n]))
 
 
@@ -61,7 +60,8 @@ def correlated(
     if len(pool) <= most:
         return tuple(name for name in names if name in pool)
     columns = draws[:, [names.index(name) for name in pool]]
-    size = np.abs(np.corrcoef(columns / columns.std(axis=0), rowvar=False))
+    with np.errstate(invalid="ignore"):  # of a coefficient that never moved
+        size = np.nan_to_num(np.abs(np.corrcoef(columns, rowvar=False)))
     np.fill_diagonal(size, 0.0)
     chosen = [int(np.argmax(size.max(axis=1)))]
     while len(chosen) < most:
@@ -133,14 +133,17 @@ def trace_figure(
     chains: Float[np.ndarray, "e n w k"],
     names: Sequence[str],
     units: Sequence[str],
-    thin: int,
+    thin: int | None,
     tau: Float[np.ndarray, " k"],
     on: Canvas = PAGE,
 ) -> AnyFigure:
-    """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time."""
+    """Median and 68 % band of walkers against the step, a colour per ensemble; the bar is one autocorrelation time.
+
+    Without `thin`, the steps from one to the next, they are draws in the order of their file.
+    """
     e, n, _, k = chains.shape
-    figure, panels = on.panels(7.1, 0.9 * k + 0.6, k, 1, labels=0.05, sharex=True, squeeze=False)
-    step = thin * np.arange(n)
+    figure, panels = on.panels(7.1, 0.9 * k + 0.6, k, 1, labels=0.05, sharex=True)
+    step = (thin or 1) * np.arange(n)
     for i, axes in enumerate(panels[:, 0]):
         for j in range(e):
             low, middle, high = np.quantile(chains[j, :, :, i], (0.16, 0.5, 0.84), axis=1)
@@ -155,7 +158,7 @@ def trace_figure(
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))
         axes.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-    panels[-1, 0].set_xlabel("step after burn-in", fontsize=SMALL)
+    panels[-1, 0].set_xlabel("step after burn-in" if thin else "draw", fontsize=SMALL)
     return figure
 
 

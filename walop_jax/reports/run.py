@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ from walop_jax.diagnosis.figure_data import DiagnosisFigureData, figure_data, re
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.fit.refit import FitResult
 from walop_jax.io import names
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import fail
 from walop_jax.io.run_folder import OF_A_FIT, RunFolder
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.free_form import FreeForm
@@ -90,6 +91,8 @@ class FigureSource:
         return other
 
     def __contains__(self, name: str) -> bool:
+        if self.run is not None and name == DATA:  # of a run that names its data, which a survey does not
+            return self.product is not None and bool(self.run.data or self.product.inputs)
         return name in (self.held if self.run is None else self.run)
 
     @property
@@ -97,9 +100,12 @@ class FigureSource:
         """The folder of the run, for messages."""
         return Path("in memory") if self.run is None else self.run.folder
 
-    def _wanted(self, name: str, read: Callable[[Run], T], advice: str = OF_A_FIT) -> T:
+    def _wanted(self, name: str, read: Callable[[Run], T | None], advice: str = OF_A_FIT) -> T:
+        """What is held under the name of a file, or `read` from the run, which must have that file."""
         if self.run is not None:
-            return read(self.run)
+            if name != DATA:
+                self.run.wanted(name, advice)
+            return read(self.run)  # pyright: ignore[reportReturnType]
         if name not in self.held:
             raise fail(f"there is no {name} of this result in memory", advice=advice)
         return self.held[name]
@@ -112,14 +118,12 @@ class FigureSource:
     @property
     def stored(self) -> Calibration | Product:
         """The same; `DataError` without one."""
-        if self.run is not None:
-            self.run.wanted(names.PRODUCT)
-        return self._wanted(names.PRODUCT, lambda run: run.product)  # pyright: ignore[reportReturnType]
+        return self._wanted(names.PRODUCT, lambda run: run.product)
 
     @property
     def rebuilt(self) -> Calibration:
         """The calibration with its model."""
-        return self._wanted(names.PRODUCT, lambda run: run.rebuilt)
+        return self._wanted(names.PRODUCT, lambda run: run.calibration)
 
     @property
     def maps(self) -> MatrixMaps:
@@ -155,10 +159,8 @@ class FigureSource:
     @functools.cached_property
     def figure_data(self) -> DiagnosisFigureData:
         """Data of the figures of a diagnosis."""
-        hint = "it comes with walop-jax diagnose"
-        return self._wanted(
-            names.FIGURE_DATA, lambda run: read_figure_data(run.wanted(names.FIGURE_DATA, hint)), hint
-        )
+        name, advice = names.FIGURE_DATA, "it comes with walop-jax diagnose"
+        return self._wanted(name, lambda run: read_figure_data(run.folder / name), advice)
 
     @functools.cached_property
     def accuracy(self) -> FieldAccuracy | None:
@@ -168,14 +170,14 @@ class FigureSource:
     @property
     def limits(self) -> DetectionLimits:
         """The detection limits of the data."""
-        advice = "run walop-jax limits -o RUN first"
-        return self._wanted(names.LIMITS, lambda run: read_limits(run.wanted(names.LIMITS, advice)), advice)
+        name, advice = names.LIMITS, "run walop-jax limits -o RUN first"
+        return self._wanted(name, lambda run: read_limits(run.folder / name), advice)
 
     @property
     def examined(self) -> int:
         """Number of the comparison of a diagnosis that is asked for."""
         count = len(self.figure_data.comparisons) - 1
-        if self.step > count:
+        if not 0 <= self.step <= count:
             result = f"the diagnosis added {count or 'no'} effect{'s' if count != 1 else ''}"
             advice = "step 0 compares the starting with the final model"
             raise fail(f"step {self.step}: {result}", advice=advice)
@@ -200,7 +202,17 @@ class RunContents:
     corner: bytes | None
     limits: DetectionLimits | None
     commissioning: dict[str, Any] | None
-    missing: tuple[str, ...]
+    missing: list[str]
+
+
+@contextlib.contextmanager
+def noted(missing: list[str], sentence: str) -> Iterator[None]:
+    """Errors of data or files of the block as a `sentence`, with the error in place of {}, if it is not yet there."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        if not any(str(error) in entry for entry in missing):
+            missing.append(sentence.format(error))
 
 
 def read_run(run: Run | Path) -> RunContents:
@@ -215,15 +227,12 @@ def read_run(run: Run | Path) -> RunContents:
     missing: list[str] = []
 
     def optional(name: str, read: Callable[[], T], lost: str, wanted: bool = True) -> T | None:
-        if name not in run:
-            if wanted:
-                missing.append(f"{name} is not there: {lost}.")
-            return None
-        try:
-            return read()
-        except (DataError, OSError) as error:
-            missing.append(f"{name} cannot be used ({error}): {lost}.")
-            return None
+        if name in run:
+            with noted(missing, f"{name} cannot be used ({{}}): {lost}."):
+                return read()
+        elif wanted:
+            missing.append(f"{name} is not there: {lost}.")
+        return None
 
     summary = DEFAULTS | run.document(names.SUMMARY, SUMMARY_KEYS)
     product = optional(names.PRODUCT, lambda: run.product, "no maps of the matrix, no pulls from the priors")
@@ -242,20 +251,27 @@ def read_run(run: Run | Path) -> RunContents:
         if stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio:
             what = f"is of another fit than {names.SUMMARY}: this folder was written to again since"
             missing.append(f"{names.DIAGNOSIS} {what}.")
-    sampled, picture = names.POSTERIOR in run, run.folder / names.CORNER
-    sample = optional(names.SAMPLE, lambda: run.document(names.SAMPLE), "no verdict on the sampling", sampled)
-    corner = optional(names.CORNER, picture.read_bytes, "no corner plot", sampled)
-    limits = optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False)
-    read_certificate = functools.partial(run.document, names.COMMISSIONING, ("go", "requirements"))
-    certificate = optional(names.COMMISSIONING, read_certificate, "no go or no-go", False)
-    if product is not None and diagnosis is None:
-        try:
-            run.calset  # noqa: B018
-        except (ValueError, OSError) as error:
-            missing.append(f"Residuals are not drawn: {error}.")
-    return RunContents(
-        source, summary, product, diagnosis, pictures, sample, corner, limits, certificate, tuple(missing)
+    sampled, corner, judged = names.POSTERIOR in run, names.CORNER, names.COMMISSIONING
+    contents = RunContents(
+        source=source,
+        summary=summary,
+        product=product,
+        diagnosis=diagnosis,
+        figure_data=pictures,
+        sample=optional(
+            names.SAMPLE, lambda: run.document(names.SAMPLE), "no verdict on the sampling", sampled
+        ),
+        corner=optional(corner, (run.folder / corner).read_bytes, "no corner plot", sampled),
+        limits=optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False),
+        commissioning=optional(
+            judged, lambda: run.document(judged, ("go", "requirements")), "no go or no-go", False
+        ),
+        missing=missing,
     )
+    if product is not None and diagnosis is None:
+        with noted(missing, "Residuals are not drawn: {}."):
+            run.calset  # noqa: B018
+    return contents
 
 
 def read_limits(path: Path) -> DetectionLimits:

@@ -33,7 +33,7 @@ from walop_jax.sky.nights import FIRST_DATE
 TEMPLATES = Path(__file__).parent / "templates"
 FONT = 9
 SMALL = 7
-NARROW = 4.5  # inches: a column of print, or half a page
+NARROW = 5.0  # inches below which a figure is one for a column of print, or half a page
 PRINTED = 7  # Type (pt) of a figure of a given width: what journals ask for at least, at the size of print
 WIDTHS = {"column": 89.0, "page": 183.0}  # widths (mm) of figures in journals, by name
 NARROWEST = 1.3  # inches of a panel of a given width: narrower ones go below each other
@@ -46,6 +46,7 @@ BEFORE = "#b2182b"  # dark enough to differ from AFTER in grey as well; both are
 AFTER = "#2166ac"
 QUIET = "0.8"
 ABOVE: Any = "outside upper center"  # of a legend
+TILE = 0.05  # deg: side of the tile of a single point
 MOST_VECTOR = 2000  # points above which tiles are drawn as pixels
 SIZES: dict[Any, Any] = {"axes.titlesize": FONT, "axes.labelsize": FONT, "legend.fontsize": SMALL}
 SETTINGS: dict[Any, Any] = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.hashsalt": "walop-jax", **SIZES}
@@ -128,34 +129,31 @@ class Canvas:
         *,
         least: float = NARROWEST,
         labels: float = LABELS,
-        turned: bool = False,
+        maps: bool = False,
         **options: Any,
     ) -> tuple[Any, Any]:
-        """A figure, and panels in it with small numbers, as `subplots` makes them.
+        """A figure, and rows of panels in it with small numbers, by the `options` of `subplots`.
 
         `least` is the width (inches) of the narrowest panel that can be read, `labels` the height of the labels
-        around each at any size; where columns are narrower, rows become columns (`turned`: of maps, which share their
-        axes), or groups of columns go below each other.
+        around each at any size; where columns are narrower, rows become columns (of `maps`, which share their axes),
+        or groups of columns go below each other.
         """
-        options |= {"sharex": True, "sharey": True} if turned else {}
-        turned = turned and self._narrow(columns, least) and rows < columns
-        group = columns
-        if turned:
-            rows, columns, group = columns, rows, rows
-        elif self._narrow(columns, least) and "width_ratios" not in options:
-            fitting = [n for n in range(1, columns) if not self._narrow(n, least)]
-            divisors = [n for n in fitting if columns % n == 0] if rows > 1 else fitting
-            group = divisors[-1]
+        options |= {"sharex": True, "sharey": True} if maps else {}
+        usual = (width / columns, height / rows)  # of a panel
+        most = columns if self.width is None else max(int(self.width / least), 1)  # side by side
+        turned = maps and rows < columns and most < columns
+        group = rows if turned else columns
+        if not turned and most < columns and "width_ratios" not in options:
+            group = next(n for n in range(most, 0, -1) if rows == 1 or columns % n == 0)
             if "height_ratios" in options:
                 options["height_ratios"] = [*options["height_ratios"]] * (columns // group)
+        rows, columns = (columns, rows) if turned else (rows, columns)
         groups = -(-columns // group)
         size = (width, height)
         if self.width is not None:
-            before = (width / (rows if turned else columns), height / (columns if turned else rows))
-            scale = self.width / group / before[0]
             lowest = 0.0 if labels < LABELS else 1.3 if rows * groups == 1 else 0.8
-            size = self.width, rows * groups * (labels + max(scale * (before[1] - labels), lowest))
-        squeeze = options.pop("squeeze", True)
+            scaled = self.width / group / usual[0] * (usual[1] - labels)
+            size = self.width, rows * groups * (labels + max(scaled, lowest))
         figure = self.figure(*size)
         axes = figure.subplots(rows * groups, group, squeeze=False, **options)
         axes = axes.reshape(groups, rows, group).swapaxes(0, 1).reshape(rows, -1)
@@ -166,21 +164,18 @@ class Canvas:
             rest = place.get_gridspec()[place.rowspan.start, place.colspan.start :]
             axes[0, columns - 1].set_subplotspec(rest)
         axes = axes[:, :columns]
-        axes = axes.T if turned else axes
-        for axis in np.ravel(axes):
+        for (
+            axis
+        ) in axes.ravel():  # here, since the settings at the time of drawing may be those of the caller
             axis.tick_params(labelsize=SMALL)
-        if squeeze:
-            axes = axes.item() if axes.size == 1 else axes.squeeze()
-        return figure, axes
-
-    def _narrow(self, columns: int, least: float) -> bool:
-        """True where so many panels do not fit side by side."""
-        return columns > 1 and self.width is not None and self.width / columns < least
+        return figure, axes.T if turned else axes
 
     def single(self, width: float, height: float) -> tuple[Any, Axes]:
         """A figure with one panel: `ax` itself where it is given."""
         if self.ax is None:
-            return self.panels(width, height)
+            figure, axes = self.panels(width, height)
+            return figure, axes.item()
+        self.ax.tick_params(labelsize=SMALL)
         for label in (self.ax.xaxis.label, self.ax.yaxis.label):
             label.set_fontsize(FONT)
         return self.ax.get_figure(), self.ax
@@ -211,45 +206,39 @@ def styled(function: Callable[P, T]) -> Callable[P, T]:
     return draw
 
 
-def _field_axes(axis: Axes, title: str) -> None:
-    """Make axes a map of the field."""
-    axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
-    axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    axis.tick_params(labelsize=SMALL)
-
-
 def field_limits(low: float, high: float) -> tuple[float, float]:
     """Limits of a map of the field along an axis, a little beyond it, in round steps: the same for all of a run."""
+    if low == high:  # a single point, with its tile
+        low, high = low - 0.5 * TILE, high + 0.5 * TILE
     step = rounded_up(max(high - low, 1e-3) / 12.0)
     margin = (high - low) / 24.0
     return math.floor((low - margin) / step + 1e-6) * step, math.ceil((high + margin) / step - 1e-6) * step
 
 
-def _set_limits(axis: Axes, x: tuple[float, float], y: tuple[float, float]) -> None:
+def _field_axes(axis: Axes, title: str, x: tuple[float, float], y: tuple[float, float]) -> None:
+    """Make axes a map of the field, the ends of which are given; labels stand on the outer edge of shared axes."""
+    axis.set(title=title, xlabel="X (deg)", ylabel="Y (deg)", aspect="equal")
     axis.set(xlim=field_limits(*x), ylim=field_limits(*y))
+    axis.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    if len(axis.get_shared_y_axes().get_siblings(axis)) > 1:
+        axis.label_outer()
     if to_rgb(axis.get_facecolor()) == to_rgb("white"):  # axes of the caller keep their colour
         axis.set_facecolor("0.93")
-
-
-def outer_labels(axes: Any) -> None:
-    """Keep the labels of a grid of maps on its outer edge only."""
-    for axis in np.ravel(axes):
-        axis.label_outer()
 
 
 def pixel_map(
     axis: Axes, title: str, values: Map, field: Field, norm: Normalize, colours: str, *, smooth: bool = False
 ) -> Any:
     """A map whose outermost pixels have their centres on the edges of `field` (left, right, bottom, top; degrees)."""
-    _field_axes(axis, title)
     low_x, high_x, low_y, high_y = field
     height, width = values.shape
-    half_x, half_y = 0.5 * (high_x - low_x) / max(width - 1, 1), 0.5 * (high_y - low_y) / max(height - 1, 1)
+    half_x = 0.5 * ((high_x - low_x) / max(width - 1, 1) or TILE)
+    half_y = 0.5 * ((high_y - low_y) / max(height - 1, 1) or TILE)
     image = axis.imshow(
         values, origin="lower", extent=(low_x - half_x, high_x + half_x, low_y - half_y, high_y + half_y),
         norm=norm, cmap=colours, interpolation="bilinear" if smooth else "nearest",
     )  # fmt: skip
-    _set_limits(axis, (low_x, high_x), (low_y, high_y))
+    _field_axes(axis, title, (low_x, high_x), (low_y, high_y))
     return image
 
 
@@ -264,7 +253,6 @@ def point_map(
     shown: Bool[np.ndarray, " p"] | None = None,
 ) -> Any:
     """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges."""
-    _field_axes(axis, title)
     shown = np.ones(len(x), bool) if shown is None else shown
     size = _spacing(x[shown], y[shown])
     visible = shown & np.isfinite(values)
@@ -277,8 +265,15 @@ def point_map(
     tiles.set_array(values[visible])
     tiles.set_rasterized(bool(visible.sum() > MOST_VECTOR))
     axis.add_collection(tiles)
-    _set_limits(axis, *((float(v[shown].min()), float(v[shown].max())) for v in (x, y)))
+    _field_axes(axis, title, *((float(v[shown].min()), float(v[shown].max())) for v in (x, y)))
     return tiles
+
+
+def error_map(axis: Axes, title: str, x: Places, y: Places, percent: Places, norm: Normalize) -> Any:
+    """Tiles of an error of q, u or p at field points; crosses (NaN): a single exposure does not measure u there."""
+    blind = np.isnan(percent)
+    axis.plot(x[blind], y[blind], "x", color="0.5", ms=4, label="u not measured in one exposure")
+    return point_map(axis, title, x, y, percent, norm, SEQUENTIAL)
 
 
 def _spacing(x: Places, y: Places) -> float:
@@ -288,57 +283,61 @@ def _spacing(x: Places, y: Places) -> float:
     distance[distance == 0] = np.inf
     nearest = distance.min(axis=1)
     nearest = nearest[np.isfinite(nearest)]
-    return float(np.median(nearest)) if nearest.size else 0.05
+    return float(np.median(nearest)) if nearest.size else TILE
 
 
-def colour_bar(figure: Any, image: Any, axes: Any, label: str = "", **options: Any) -> Any:
-    """A colour bar with small numbers, plain ones on a logarithmic scale; of a single map it has the height.
+def colour_bar(image: Any, label: str = "", axes: Any = None, **options: Any) -> Any:
+    """A colour bar with small numbers, plain ones on a logarithmic scale: of all `axes`, or of a map, in its height.
 
-    In a column of print it has three numbers at most: there is no room for 99.95 beside the next map.
+    In a column of print that of a map has three numbers at most: there is no room for 99.95 beside the next.
     """
-    if isinstance(axes, Axes):
-        bar = figure.colorbar(image, cax=axes.inset_axes((1.04, 0.0, 0.06, 1.0)), **options)
-    else:
-        bar = figure.colorbar(image, ax=axes, **({"pad": 0.03} | options))
+    figure = image.axes.figure
+    place = (
+        {"ax": axes, "pad": 0.03}
+        if axes is not None
+        else {"cax": image.axes.inset_axes((1.04, 0.0, 0.06, 1.0))}
+    )
+    bar = figure.colorbar(image, **(place | options))
     bar.set_label(label, fontsize=SMALL + 1)
     bar.ax.tick_params(labelsize=SMALL, which="both")
     if bar.ax.get_yscale() == "log":
         plain_ticks(bar.ax.yaxis)
     else:
         bar.ax.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))
-        if isinstance(axes, Axes) and figure.bbox.width < NARROW * figure.dpi:
+        if axes is None and figure.bbox.width < NARROW * figure.dpi:
             bar.ax.yaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 2.5, 5, 10]))
     return bar
 
 
-def angle_ticks(axis: Axis, figure: Any, columns: int) -> None:
-    """Angles in degrees every 45°, or 90° or 180° where panels, so many side by side, have no room for more."""
-    low, high = axis.get_view_interval()
-    room = max(figure.get_figwidth() / columns - 0.5, 0.5) / 0.32  # numbers
-    axis.set_major_locator(MultipleLocator(next((s for s in (45, 90) if (high - low) / s <= room), 180)))
+def angle_ticks(axis: Axes) -> None:
+    """Angles in degrees every 45° along X, or 90° or 180° where panels side by side have no room for more."""
+    low, high = axis.get_xlim()
+    place, figure = axis.get_subplotspec(), axis.figure
+    columns = 1 if place is None else place.get_gridspec().ncols
+    room = max(figure.bbox.width / figure.dpi / columns - 0.5, 0.5) / 0.32  # numbers
+    step = next((s for s in (45, 90) if (high - low) / s <= room), 180)
+    axis.xaxis.set_major_locator(MultipleLocator(step))
 
 
-def calendar(axis: Axes, mjd: Any) -> bool:
-    """Write dates (UTC), a day at least, along X where times are MJD; False where they only count."""
-    mjd = np.asarray(mjd, float)
-    # Of a single date matplotlib would draw a tenth of all days since 1970.
+def calendar(axis: Axes, mjd: Any, counted: str = "") -> None:
+    """Write dates (UTC), a day at least, along X where times are MJD; numbers have the label `counted`."""
     low, high = axis.dataLim.intervalx
-    margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
-    axis.set_xlim(low - margin, high + margin)
-    if not mjd.size or not np.nanmin(mjd) > FIRST_DATE:
-        return False
-    locator = AutoDateLocator(minticks=3, maxticks=7)
-    axis.xaxis.set_major_locator(locator)
-    axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-    axis.xaxis.get_offset_text().set_fontsize(FONT)
-    axis.set_xlabel("date (UTC)")
-    return True
+    if low <= high:  # of a single date matplotlib would draw a tenth of all days since 1970
+        margin = max(0.05 * (high - low), 0.5 * (1.0 - (high - low)))
+        axis.set_xlim(low - margin, high + margin)
+    dated = np.any(np.asarray(mjd, float) > FIRST_DATE)
+    axis.set_xlabel("date (UTC)" if dated else counted)
+    if dated:
+        locator = AutoDateLocator(minticks=3, maxticks=7)
+        axis.xaxis.set_major_locator(locator)
+        axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        axis.xaxis.get_offset_text().set_fontsize(FONT)
 
 
 def day_of(mjd: Any) -> Any:
     """Days of matplotlib (since 1970) of MJD; numbers of exposure groups stay as they are."""
     mjd = np.asarray(mjd, float)
-    return mjd - 40587.0 if mjd.size and np.nanmin(mjd) > FIRST_DATE else mjd
+    return np.where(mjd > FIRST_DATE, mjd - 40587.0, mjd)
 
 
 def plain_ticks(axis: Axis) -> None:
@@ -353,17 +352,13 @@ def plain_ticks(axis: Axis) -> None:
         ticks = [tick for tick in ticks if 0.999 * low <= tick <= 1.001 * high]
         if len(ticks) <= room:
             break
-    axis.set_ticks(ticks, labels=[plain(tick, 1 + (tick * 1.001 >= 1)) for tick in ticks])
+    axis.set_ticks(ticks, labels=[plain(tick) for tick in ticks])
     axis.set_minor_locator(NullLocator())
 
 
-def plain(value: float, digits: int = 2) -> str:
-    """A number with so many digits, never as a power of ten below a million: 0.000094."""
-    if not value or not math.isfinite(value):
-        return f"{value:g}"
-    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    text = f"{value:.{places}f}"
-    return with_minus_sign(text.rstrip("0").rstrip(".") if "." in text and abs(value) >= 1e-3 else text)
+def plain(value: float) -> str:
+    """A number with two digits, never as a power of ten: 0.000094."""
+    return with_minus_sign(np.format_float_positional(value, 2, fractional=False, trim="-"))
 
 
 def largest_size(*maps: Any) -> float:
@@ -412,7 +407,7 @@ def element_scale(element: int, maps: Maps) -> tuple[Normalize, str]:
 
 
 def matrix_panels(
-    figure: Any, axes: Any, maps: Maps, field: Field, elements: Sequence[int], *, smooth: bool = False
+    axes: Any, maps: Maps, field: Field, elements: Sequence[int], *, smooth: bool = False
 ) -> None:
     """Draw elements of the instrument matrix over the field, in per cent; their ranges stand in the titles.
 
@@ -427,10 +422,9 @@ def matrix_panels(
         span = f"{_short(low, high - low)} to {_short(high, high - low)} %"
         title = f"{PAPER_NAMES[kind]} {element_symbols(arms)[i]}\n{span}"
         image = pixel_map(axis, title, 100.0 * maps[i], field, *element_scale(i, maps), smooth=smooth)
-        colour_bar(figure, image, axis)
+        colour_bar(image)
         if weak is not None and i > 3 and weak.min() < SMALLEST_DETERMINANT < weak.max():
             axis.contour(weak, levels=[SMALLEST_DETERMINANT], extent=field, colors="0.15", linewidths=0.7)
-    outer_labels(axes)
 
 
 def _short(value: float, span: float) -> str:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from walop_jax.fit.verdict import SUSPECT_SIGMA
+from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.style import AFTER, BEFORE, PAGE, QUIET, SMALL, Canvas, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
 from walop_jax.science.watch_found import Watch
@@ -32,7 +34,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -
     """
     broken, names = document["breaks"], tracked(document)
     count = len(names)
-    figure, axes = on.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True, squeeze=False)
+    figure, axes = on.panels(6.4, 0.9 + 1.25 * count, count, 1, sharex=True)
     for axis, name in zip(axes[:, 0], names, strict=True):
         rows = tracks[np.asarray(tracks["NAME"]).astype(str) == name]
         mjd, value, error, alone, alone_error = (
@@ -54,7 +56,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -
             else:
                 axis.axvline(float(day_of(entry["before"])), color=BEFORE, lw=0.9, ls="--")
         _events(axis, document["events"])
-        unit = str(rows["UNIT"][0]) if len(rows) else ""
+        unit = unit_in_words(str(rows["UNIT"][0])) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
     calendar(axes[-1, 0], tracks["MJD"])
     return figure
@@ -66,9 +68,9 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
     nights: Sequence[Mapping[str, Any]] = document["by_night"]
     excess = np.array([night["excess"] for night in nights], float)
     mjd = np.array([night["mjd"] for night in nights], float)
-    figure, axis = on.panels(6.4, 2.0)
+    figure, axis = on.single(6.4, 2.0)
     axis.axhspan(-2.0, 2.0, color=QUIET, lw=0)
-    axis.scatter(day_of(mjd), excess, s=6, color=np.where(excess > 5.0, BEFORE, AFTER).tolist())
+    axis.scatter(day_of(mjd), excess, s=6, color=np.where(excess > SUSPECT_SIGMA, BEFORE, AFTER).tolist())
     _events(axis, document["events"])
     axis.set_ylabel("(χ² − dof)/σ")
     calendar(axis, mjd)
@@ -79,21 +81,18 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
 def watch_figure(found: Watch) -> Figure:
     """Gain of every camera since the calibration (%) by group; band: smallest step seen in 99 %, lines: changes."""
     count = len(found.cameras)
-    figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True, squeeze=False)
-    named = {change.camera for change in found.changes}
-    for k, axis in enumerate(axes[:, 0]):
-        of_camera = (values[:, k] for values in (found.gain, found.error, found.smallest))
-        gain, error, detectable = (100.0 * values for values in of_camera)
-        time = day_of(found.time)
-        axis.fill_between(time, -detectable, detectable, color=QUIET, lw=0, step=None)
-        colour = BEFORE if found.cameras[k] in named else AFTER
+    figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True)
+    time, named = day_of(found.time), {change.camera for change in found.changes}
+    percent = (100.0 * values.T for values in (found.gain, found.error, found.smallest))
+    for axis, camera, gain, error, detectable in zip(axes[:, 0], found.cameras, *percent, strict=True):
+        axis.fill_between(time, -detectable, detectable, color=QUIET, lw=0)
+        colour = BEFORE if camera in named else AFTER
         axis.errorbar(time, gain, error, fmt="o", ms=3, lw=1, color=colour)
         for change in found.changes:
             axis.axvline(float(day_of(change.time)), color=BEFORE, lw=0.8, ls="--")
-        axis.set_ylabel(f"{found.cameras[k]} (%)")
+        axis.set_ylabel(f"{camera} (%)")
     axes[0, 0].set_title("gain since the calibration; grey: steps too small to be detected")
-    if not calendar(axes[-1, 0], found.time):
-        axes[-1, 0].set_xlabel("number of the exposure group")
+    calendar(axes[-1, 0], found.time, "number of the exposure group")
     return figure
 
 
@@ -112,9 +111,8 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
     """Quality numbers night by night, of all cameras last; grey: their limits, red: outside."""
     gains = [name for name in table.colnames if name.startswith(f"{GAIN}_")]
     panels = {**PANELS, GAIN: (tuple(gains), 1.0, "gain of cameras")}
-    figure, axes = PAGE.panels(6.4, 0.9 + 1.1 * len(panels), len(panels), 1, sharex=True, squeeze=False)
-    night = np.asarray(table["NIGHT"], float)
-    time = day_of(night)
+    figure, axes = PAGE.panels(6.4, 0.9 + 1.1 * len(panels), len(panels), 1, sharex=True)
+    time = day_of(table["NIGHT"])
     for axis, (limited, (names, factor, label)) in zip(axes[:, 0], panels.items(), strict=True):
         for name, marker in zip(names, itertools.cycle("osD^v<>phx"), strict=False):
             values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
@@ -130,7 +128,7 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
         if len(names) > 1:
             above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
             axis.legend(ncol=len(names), frameon=False, **above)
-    calendar(axes[-1, 0], night)
+    calendar(axes[-1, 0], table["NIGHT"])
     return figure
 
 
