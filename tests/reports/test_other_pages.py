@@ -19,7 +19,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError
 from walop_jax.reports.page import kind_of_run, render, render_other
 from walop_jax.reports.run import read_limits, read_run
-from walop_jax.reports.survey_figures import nights_figure
+from walop_jax.reports.survey_figures import nights_figure, tracks_figure
 
 SHOWN = Display(
     "The instrument HAS CHANGED",
@@ -108,7 +108,9 @@ def test_an_epoch_shows_what_has_changed_of_the_matrix(tmp_path: Path):
     assert len(Page(html).images) == 1
     html, missing = written(tmp_path, "epoch", fits=False, old_file="lost.fits")
     assert "The change of the instrument matrix is not drawn" in missing[0]
-    for same in ({"fits": None}, {"fits": True, "same": True}):
+    html, missing = written(tmp_path, "epoch", fits=False, old_file=None)
+    assert "the old calibration was in memory" in missing[0]
+    for same in ({}, {"fits": None}, {"fits": True, "same": True}):
         html, missing = written(tmp_path / "new", "epoch", **same, old_file=str(tmp_path / "old"))
         assert (missing, Page(html).images) == ((), [])
 
@@ -130,6 +132,8 @@ def test_the_tracks_of_a_survey(tmp_path: Path):
         "NAME": ["half1.wedge"] * 4,
         "UNIT": ["rad"] * 4,
     }
+    micrometres = tracks_figure(Table(columns | {"UNIT": ["um"] * 4}), document)
+    assert micrometres.axes[0].get_ylabel() == "half1.wedge\n(µm)"
     Table(columns).write(tmp_path / "tracks.fits")
     assert len(Page(written(tmp_path, "survey", **document)[0]).images) == 2
 
@@ -171,7 +175,9 @@ def test_page_of_limits(tmp_path: Path):
 def test_limits_of_the_same_data_stand_beside_the_fit(tmp_path: Path):
     """And those of other data are left out, and said to be."""
     handmade_run.make_limits(handmade_run.make_refit(tmp_path))
-    assert "clp_zero.angle" in Page(render(read_run(tmp_path))[0]).text
+    text = Page(render(read_run(tmp_path))[0]).text
+    assert "clp_zero.angle" in text
+    assert "99 % probability: 2 amplitudes" in text.replace("\N{NO-BREAK SPACE}", " ")
     handmade_run.make_limits(tmp_path, sha256="cd" * 32)
     found = read_run(tmp_path)
     assert found.limits is None

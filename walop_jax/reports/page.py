@@ -22,7 +22,7 @@ from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, signed
-from walop_jax.io.errors import DataError, fail
+from walop_jax.io.errors import fail
 from walop_jax.io.names import COMMISSIONING, DOCUMENTS, LIMITS, SUMMARY, TRACKS
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
@@ -31,7 +31,7 @@ from walop_jax.posterior.run import Run
 from walop_jax.reports import diagnosis_figures, figures, survey_figures
 from walop_jax.reports.named import draw
 from walop_jax.reports.posterior_figures import unit_in_words
-from walop_jax.reports.run import FigureSource, RunContents, read_limits
+from walop_jax.reports.run import FigureSource, RunContents, noted, read_limits
 from walop_jax.reports.style import PAGE, TEMPLATES, WIDTHS, Canvas, texts
 from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
 from walop_jax.science.commissioning import Certificate, requirements
@@ -121,11 +121,8 @@ def drawn(source: FigureSource, names: Sequence[str], missing: list[str], **word
     """Figures by name, with captions; what cannot be drawn is added to `missing`."""
     pictures = []
     for name in names:
-        try:
+        with noted(missing, f"The figure {name} is not drawn: {{}}."):
             pictures.append(picture(name, lambda canvas, name=name: draw(name, source.on(canvas)), **words))
-        except (ValueError, OSError) as error:
-            if not any(str(error) in sentence for sentence in missing):
-                missing.append(f"The figure {name} is not drawn: {error}.")
     return pictures
 
 
@@ -139,7 +136,8 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     """
     summary, diagnosis, folder = run.summary, run.diagnosis, run.source.folder
     of_fit = (summary.get("accuracy_of_p") or {}).get("goal", GOAL)
-    run = dataclasses.replace(run, source=dataclasses.replace(run.source, goal=goal or of_fit))
+    source = dataclasses.replace(run.source, goal=goal or of_fit)
+    run = dataclasses.replace(run, source=source, missing=[*run.missing])
     fit = display_of(summary, folder / SUMMARY)
     head = fit if diagnosis is None else display_of(diagnosis, folder / "diagnosis.json")
     trusted = bool(summary.get("trusted", summary["converged"]))
@@ -149,10 +147,11 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     if trusted and requirements_shown is not None and (goal is not None or not answered):
         accuracy = _accuracy(run)
         head = head if accuracy is None else _with_goal(head, accuracy)
-    missing = [*run.missing]
-    error_maps = _accuracy_pictures(run, missing) if trusted else ()
-    limits = () if run.limits is None else (run.limits.display(),)
-    limits = [dataclasses.replace(d, title=f"{d.title}: {len(d.rows)} amplitudes") for d in limits]
+    error_maps = _accuracy_pictures(run) if trusted else ()
+    limits = []
+    if run.limits is not None:
+        shown = run.limits.display()
+        limits.append(dataclasses.replace(shown, title=f"{shown.title}: {len(run.limits.limits)} amplitudes"))
     origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
     sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
     when = "" if run.product is None else run.product.date.replace("T", " at ")
@@ -161,12 +160,12 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         Section("commissioning", "Go or no-go", requirements_shown),
         Section("accuracy", "Accuracy of p over the field", pictures=error_maps),
         Section("data", "The data", Display("", () if run.product is None else data_in_words(run.product))),
-        *([] if diagnosis is None else _diagnosed(run, diagnosis, head, missing)),
-        Section("residuals", "Residuals before and after", pictures=_residual_pictures(run, missing)),
+        *([] if diagnosis is None else _diagnosed(run, diagnosis, head)),
+        Section("residuals", "Residuals before and after", pictures=_residual_pictures(run)),
         *([] if diagnosis is None else [_candidates(run, diagnosis)]),
         Section("limits", "What these data can show", folded=limits),
         Section("warnings", "Warnings", Display("", notes=_warnings(run) or ("None.",))),
-        Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run, missing)),
+        Section("matrix", "Instrument matrix", pictures=_matrix_pictures(run)),
         Section("pulls", "Largest pulls from the priors", _pulls(run)),
         _posterior(run),
         _parameters(run, fit if diagnosis is not None else dataclasses.replace(fit, facts=())),
@@ -185,9 +184,9 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
         name=folder.resolve().name,
         versions=summary["versions"],
         next=_next(run, good),
-        missing=missing,
+        missing=run.missing,
     )
-    return text, tuple(missing)
+    return text, tuple(run.missing)
 
 
 def _asked(run: RunContents) -> tuple[Display | None, bool]:
@@ -220,55 +219,53 @@ def _with_goal(head: Display, accuracy: FieldAccuracy) -> Display:
     return dataclasses.replace(head, facts=(*answer, *unchanged))
 
 
-def _accuracy_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+def _accuracy_pictures(run: RunContents) -> list[Picture]:
     """The error of p over the field, and the effect of a mistake that goes unnoticed."""
     if run.product is None:
         return []
-    pictures = drawn(run.source, ["accuracy"], missing, filter=run.product.maps.filter)
+    pictures = drawn(run.source, ["accuracy"], run.missing, filter=run.product.maps.filter)
     if pictures and run.limits is not None and run.limits.worst is not None:
-        pictures += drawn(run.source, ["protection"], missing)
+        pictures += drawn(run.source, ["protection"], run.missing)
     return pictures
 
 
-def _residual_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+def _residual_pictures(run: RunContents) -> list[Picture]:
     """Residuals with the starting and the final model."""
     data = run.figure_data
     if run.diagnosis is None:
-        return [] if run.product is None else drawn(run.source, ["residuals"], missing)
+        return [] if run.product is None else drawn(run.source, ["residuals"], run.missing)
     if data is None:
         return []
     overall, *steps = data.comparisons
     if steps:
         names = ["ladder", "rms", "shares"] if len(steps) > 1 else ["ladder", "shares"]
-        return drawn(run.source, names, missing)
+        return drawn(run.source, names, run.missing)
     residuals = data.points, {"residuals": overall.field["BEFORE"]}, data.cameras
     draw_whole = functools.partial(diagnosis_figures.residual_maps, *residuals)
     whole = picture("whole", draw_whole, combination=in_greek(overall.combination))
-    return [whole, *drawn(run.source, ["shares"], missing)]
+    return [whole, *drawn(run.source, ["shares"], run.missing)]
 
 
-def _matrix_pictures(run: RunContents, missing: list[str]) -> list[Picture]:
+def _matrix_pictures(run: RunContents) -> list[Picture]:
     """Maps of the instrument matrix, of its errors, and of the residuals of whole frames."""
     if run.product is None:
         return []
     maps, residuals = run.product.maps, run.product.residuals
     words = {"filter": maps.filter, "covariance": run.product.verdict.covariance_from}
-    pictures = drawn(run.source, ["matrix", "matrix-errors"], missing, **words)
+    pictures = drawn(run.source, ["matrix", "matrix-errors"], run.missing, **words)
     if residuals is not None:
         words = {"filter": residuals.filter, "significance": f"{residuals.significance():.1f}"}
         pictures += drawn(run.source, ["residual-map"], [], **words)
     return pictures
 
 
-def _diagnosed(
-    run: RunContents, diagnosis: Mapping[str, Any], head: Display, missing: list[str]
-) -> list[Section]:
+def _diagnosed(run: RunContents, diagnosis: Mapping[str, Any], head: Display) -> list[Section]:
     """Sections on findings, with the figures of every addition."""
     comparisons, pictures = () if run.figure_data is None else run.figure_data.comparisons, []
     for number, comparison in enumerate(comparisons[1:], start=1):
         words = {"effect": comparison.effect, "combination": in_greek(comparison.combination)}
         step = dataclasses.replace(run.source, step=number)
-        pictures += drawn(step, ["effect", "signature"], missing, **words)
+        pictures += drawn(step, ["effect", "signature"], run.missing, **words)
     patterns = (diagnosis["unexplained"] or {}).get("patterns", ())
     rows = tuple((row["pattern"], _chance(row)) for row in patterns)
     shown = dataclasses.replace(head, facts=())
@@ -374,7 +371,9 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
         steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {other}"))
     if run.limits is None and trusted:
         steps.append(("list mistakes that these data would not show", f"walop-jax limits {sets} -o {name}"))
-    return [*steps, ("plan better exposures", f"walop-jax plan {name} --minutes 10")]
+    if run.product is None or run.product.maps.arms == 2:
+        steps.append(("plan better exposures", f"walop-jax plan {name} --minutes 10"))
+    return steps  # with other arms it is for the user to say which error is to be small
 
 
 def in_greek(text: str) -> str:
@@ -438,15 +437,13 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
     if kind == "epoch":
         return _change_of_the_matrix(folder, document, missing)
     if kind == "survey":
-        results = []
-        try:
+        pictures = []
+        with noted(missing, "Parameters against time are not drawn: {}."):
             tracks = read_input_table(folder / TRACKS).table
             if survey_figures.tracked(document):
                 draw_tracks = functools.partial(survey_figures.tracks_figure, tracks, document)
-                results = [picture("tracks", draw_tracks)]
-        except DataError as error:
-            missing.append(f"Parameters against time are not drawn: {error}.")
-        return [*results, picture("nights", functools.partial(survey_figures.nights_figure, document))]
+                pictures.append(picture("tracks", draw_tracks))
+        return [*pictures, picture("nights", functools.partial(survey_figures.nights_figure, document))]
     pattern = rf"{kind}.*\.png"
     names = {name: words for name, words in texts("captions").items() if re.fullmatch(pattern, name)}
     missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
@@ -459,11 +456,11 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
 
 def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: list[str]) -> list[Picture]:
     """Maps of the change of the instrument matrix, if both calibrations are there and worth comparing."""
-    if document["fits"] is None or document.get("same"):
-        return []
-    try:
-        old, new = (read_product(Path(path)).maps for path in (document["old_file"], folder))
-        return [picture("change", functools.partial(figures.matrix_change_figure, old, new))]
-    except (ValueError, OSError, KeyError, TypeError) as error:
-        missing.append(f"The change of the instrument matrix is not drawn: {error}.")
-        return []
+    pictures, old_file = [], document.get("old_file")
+    if document.get("fits") is not None and not document.get("same"):
+        with noted(missing, "The change of the instrument matrix is not drawn: {}."):
+            if old_file is None:
+                raise fail("the old calibration was in memory, not in a file")
+            old, new = (read_product(Path(path)).maps for path in (old_file, folder))
+            pictures.append(picture("change", functools.partial(figures.matrix_change_figure, old, new)))
+    return pictures

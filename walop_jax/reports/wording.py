@@ -57,10 +57,10 @@ def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]
             rows.append((name, _settings(p.angle[p.inside], bool((~p.inside).any()))))
     moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
-    listed = some([str(name) for name in product.sources.name], _MANY)
+    standards = some([str(name) for name in product.sources.name], _MANY)
     rows += [
         ("Moon patches", str(len(places)) if places else "none"),
-        ("Standards", listed or "none"),
+        ("Standards", standards or "none"),
         ("Temperature", _range(e.temp, "°C")),
         ("Filters", ", ".join(sorted({str(name) for name in e.filter}))),
     ]
@@ -78,7 +78,7 @@ def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
 def _angles(angles: Float[np.ndarray, " a"]) -> str:
     if angles.size == 0:
         return "none"
-    turn = np.unique(np.round(np.mod(angles, 180.0), 3))
+    turn = np.unique(np.mod(np.round(angles, 3), 180.0))
     gap = np.diff(np.append(turn, turn[0] + 180.0)).max()
     full = ", over a full turn" if np.ptp(np.mod(angles, 360.0)) > 180.0 else ""
     return f"{len(turn)} modulo 180°, widest gap {gap:.3g}°{full}"
