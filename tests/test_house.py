@@ -209,7 +209,7 @@ MOST_LINES = {
     "nights": 2598,
     "plans": 2219,
     "paper": 775,
-    "reports": 2664,
+    "reports": 2665,
     "commands": 4081,
 }
 """Lines of each room: raising one is a decision of its own."""

@@ -165,6 +165,9 @@ def test_the_error_of_p_of_any_goal_and_of_nothing_before():
     right = of_calibrations.accuracy_figure(accuracy).axes[1]
     low, high = right.get_xlim()
     assert low < 0.001 < high  # the goal, in per cent
+    left = of_calibrations.accuracy_figure(dataclasses.replace(accuracy, goal=0.005)).axes[0]
+    (line,) = left.collections
+    assert line.get_linestyle() == [(0.0, None)]  # that of the goal is whole
     field = {"x": [0.0, 0.1], "y": [0.0, 0.0], "before": [None, None], "p_error": [0.001, None]}
     figure = of_calibrations.planned_figure(field)
     assert [shown.get_array().tolist() for shown in tiles(figure)] == [[], [0.1]]

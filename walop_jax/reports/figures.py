@@ -244,7 +244,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     image = style.pixel_map(left, title, percent, accuracy.extent, norm, style.SEQUENTIAL, smooth=True)
     style.colour_bar(image, extend="both")
     if low < goal < high:
-        left.contour(np.log10(percent), [np.log10(goal)], extent=accuracy.extent, colors="w", linewidths=1.2)
+        left.contour(np.log(percent / goal), [0.0], extent=accuracy.extent, colors="w", linewidths=1.2)
     edges = np.geomspace(0.8 * low, 1.25 * high, 37)
     share = np.full(percent.size, 100.0 / percent.size)
     right.hist(percent.ravel(), edges.tolist(), weights=share, color=style.AFTER)
@@ -274,6 +274,7 @@ def planned_figure(field: Mapping[str, Sequence[float | None]], on: Canvas = PAG
     highest = min(max(float(np.nanmax(maps[0], initial=0.0)), highest), max(_RANGE[1], highest))
     norm = LogNorm(lowest, highest)
     for axis, values, when in zip(axes, maps, ("before", "after"), strict=True):
-        image = style.error_map(axis, f"error of p {when}", *places, np.minimum(values, highest), norm)
+        title, shown = f"error of p {when}", np.minimum(values, highest)
+        image = style.error_map(axis, title, places[0], places[1], shown, norm)
     style.colour_bar(image, "error of p (%)", axes, extend="max", pad=0.02)
     return figure

@@ -101,7 +101,7 @@ class FigureSource:
         return Path("in memory") if self.run is None else self.run.folder
 
     def _wanted(self, name: str, read: Callable[[Run], T | None], advice: str = OF_A_FIT) -> T:
-        """What is held under the name of a file, or `read` from the run, which must have that file."""
+        """Contents under the name of a file: those in memory, or `read` from the run, which must have it."""
         if self.run is not None:
             if name != DATA:
                 self.run.wanted(name, advice)
