@@ -77,6 +77,21 @@ def test_rows_that_do_not_hold_q_and_u_are_not_asked(vectors, tabulated_once):
     assert overlap(vectors.calibration, fields(vectors, 1, rotator=(0.0, 45.0), lacking=(2, 3))) is None
 
 
+@pytest.mark.long
+def test_none_of_two_hundred_sound_fields_and_every_one_with_an_error(vectors, tabulated_once):
+    """0.01 and 0.02 per deg over 0.2 deg, fifty fields each; sizes within a quarter."""
+    sound = [overlap(vectors.calibration, fields(vectors, seed)) for seed in range(200)]
+    assert sum(found.differs for found in sound) == 0
+    for slope in (0.01, 0.02):
+        errors = [
+            overlap(vectors.calibration, fields(vectors, seed, slope)) for seed in range(10_000, 10_050)
+        ]
+        assert all(found.differs for found in errors)
+        sizes = [found.excess for found in errors]
+        assert np.ptp(sizes) < 0.25 * np.mean(sizes)
+        assert 0.07 * slope < np.mean(sizes) < 0.14 * slope
+
+
 def test_stars_at_one_place_are_not_asked(vectors):
     rows = fields(vectors, 0)
     assert overlap(vectors.calibration, rows.of_rows(rows.time == 60000.0)) is None
