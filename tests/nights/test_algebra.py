@@ -153,7 +153,7 @@ def test_scores_of_changes_equal_a_fit_with_one_column_more(name, spanning):
     for c, cell in enumerate(found.system.cells):
         for once in (False, True):
             units = cell.units if once else np.arange(cell.units[0], len(e))
-            score, information = (scan[2], scan[3]) if once else (scan[0], scan[1])
+            score, information = (of_kinds[int(once)] for of_kinds in scan)
             if c == 0 and not once:
                 assert not information[0].any()
                 continue

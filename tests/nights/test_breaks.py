@@ -74,7 +74,7 @@ def test_a_step_a_bad_night_and_a_drift():
     change[40:, 5], change[20, 1] = 1.2, 2.0
     change[:, 3] = 12.0 * np.linspace(-0.15, 0.15, NIGHTS)
     data = series(7, change)
-    found, laws, solution = breaks.find(data, LAWS, ())
+    found, laws = breaks.find(data, LAWS, ())
     kinds = {one.kind: one for one in found}
     assert sorted(kinds) == ["bad night", "drift", "step"]
     step, bad = kinds["step"], kinds["bad night"]
@@ -91,7 +91,6 @@ def test_a_step_a_bad_night_and_a_drift():
     assert {drift.name, *drift.alike} >= {"p2.x", "p3.x"}
     assert drift.nights_needed > NIGHTS
     assert breaks.find(data, laws, ())[0] == ()
-    assert solution.chi2 == pytest.approx(breaks.solved(data, laws).chi2)
 
 
 def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for_is_its_law():
@@ -100,7 +99,7 @@ def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for
     data = series(7, change)
     (first,) = breaks.find(data, LAWS, ())[0]
     assert first.alike
-    (second,), laws, _ = breaks.find(data, LAWS, (), lambda parameter: parameter.name != first.name)
+    (second,), laws = breaks.find(data, LAWS, (), lambda parameter: parameter.name != first.name)
     assert second.name in first.alike
     assert first.name in second.alike
     assert second.z**2 > first.z**2 - breaks.RIVAL
@@ -158,8 +157,8 @@ def test_the_size_of_a_step_between_two_intervals_is_the_difference_of_their_val
     data = series(7, change)
     middle = 0.5 * (data.nights[10].end + data.nights[11].begin)
     for law in (Law(), Law(("interval",), at=(middle,))):
-        (step,), _, solution = breaks.find(data, (LAWS[0], law, *LAWS[2:]), ())
-        one = breaks.at_solution(data, solution, step)
+        (step,), laws = breaks.find(data, (LAWS[0], law, *LAWS[2:]), ())
+        one = breaks.at_solution(data, breaks.solved(data, laws), step)
         assert (one.kind, one.name) == ("step", "p1.x")
         assert abs(one.size - 1.2) < 4.0 * one.error
         sizes.append((one.size, one.error))

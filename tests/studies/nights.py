@@ -178,17 +178,15 @@ def null_scores(solution, count: int, rng: np.random.Generator) -> np.ndarray:
         "ug,ugm->gm", system.basis, noise[:, system.at]
     )
     rights: list[np.ndarray] = []
-    for c, cell in enumerate(system.cells):
+    for cell in system.cells:
         own = np.sqrt(cell.precision)[:, None] * rng.normal(size=(len(cell.parameter), count))
         for v, unit in enumerate(cell.units):
             own -= cell.covers[:, v : v + 1] * noise[unit][cell.parameter]
-        for k, i in enumerate(cell.parameter if c else ()):
-            (before,) = np.flatnonzero(system.cells[c - 1].parameter == i)
-            variance = system.rates[i] ** 2 * (cell.mjd[k] - system.cells[c - 1].mjd[before])
-            step = rng.normal(size=count) / np.sqrt(variance)
-            own[k] += step
-            rights[-1][before] -= step
         rights.append(own)
+    for strength, (b, j), (c, k) in system.steps():
+        step = rng.normal(size=count) * np.sqrt(strength)
+        rights[c][k] += step
+        rights[b][j] -= step
     for c, entry in enumerate(solution.cells):
         if c:
             rights[c] = rights[c] - entry.before @ linalg.cho_solve(
@@ -235,7 +233,7 @@ def sealed(count: int, start: int = 0, nights: int = 200) -> None:
             known = information(plain, laws, names.index(name), first, last)
         expected = float(rng.uniform(5.0, 15.0))
         truth[first:last, names.index(name)] += rng.choice([-1.0, 1.0]) * expected / np.sqrt(known)
-        found, _, _ = breaks.find(together(nights_at(truth, days, rng)), laws)
+        found, _ = breaks.find(together(nights_at(truth, days, rng)), laws)
         band = 0 if expected < 7.0 else 1 if expected < 8.0 else 2
         number = np.array([int(START + day) for day in days])
         at = [int(np.searchsorted(number, one.night)) for one in found]

@@ -58,8 +58,8 @@ class Equations:
 
     def only(self, keep: Bool[np.ndarray, " u"]) -> Equations:
         """The equations of some units."""
-        names = ("mjd", "night", "file", "chi2", "gradient", "matrix")
-        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in names})
+        of_units = {name: values[keep] for name, values in vars(self).items() if name != "scale"}
+        return dataclasses.replace(self, **of_units)
 
 
 class Global(NamedTuple):
@@ -72,14 +72,13 @@ class Global(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions, times of walk states."""
+    """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions."""
 
     units: Int[np.ndarray, " v"]
     parameter: Int[np.ndarray, " k"]
     covers: Float[np.ndarray, "k v"]
     mean: Float[np.ndarray, " k"]
     precision: Float[np.ndarray, " k"]
-    mjd: Float[np.ndarray, " k"]  # NaN: not a state of a walk
 
 
 class Eliminated(NamedTuple):
@@ -131,19 +130,26 @@ class System:
 
     def functions(self, mjd: Any) -> Float[np.ndarray, "t g"]:
         """The functions of time of the global unknowns."""
-        courses = {form: form.at(mjd) for form in dict.fromkeys(entry.form for entry in self.globals)}
-        values = np.ones((len(np.atleast_1d(mjd)), len(self.globals)))
-        for g, entry in enumerate(self.globals):
-            values[:, g] = courses[entry.form]
-        return values
+        times = np.atleast_1d(mjd)
+        courses = (entry.form.at(times) for entry in self.globals)
+        return np.column_stack([np.zeros((len(times), 0)), *courses])
+
+    @functools.cached_property
+    def locals(self) -> list[tuple[int, int, int, Int[np.ndarray, " v"]]]:
+        """Of every unknown of a cell: the cell, its place in it, its parameter, the units that it acts in."""
+        return [
+            (c, k, i, cell.units[cell.covers[k] > 0])
+            for c, cell in enumerate(self.cells)
+            for k, i in enumerate(cell.parameter.tolist())
+        ]
 
     @functools.cached_property
     def states(self) -> dict[int, list[tuple[float, int, int]]]:
         """The states of the walk of every parameter that walks, night by night: time (MJD), cell, place in the cell."""
         states: dict[int, list[tuple[float, int, int]]] = {}
-        for c, cell in enumerate(self.cells):
-            for k in np.flatnonzero(np.isfinite(cell.mjd)).tolist():
-                states.setdefault(int(cell.parameter[k]), []).append((float(cell.mjd[k]), c, k))
+        for c, k, i, units in self.locals:
+            if np.isfinite(self.rates[i]):
+                states.setdefault(i, []).append((float(self.equations.mjd[units].mean()), c, k))
         return states
 
     def steps(self) -> Iterator[tuple[float, list[int], list[int]]]:
@@ -167,19 +173,15 @@ def _cells(equations: Equations, laws: Laws, mean: Vector, width: Vector, spread
     cells: list[Cell] = []
     for number in np.unique(label):
         units = np.flatnonzero(label == number)
-        parameter, covers, priors, times = [], [], [], []
+        parameter, covers, priors = [], [], []
         for i, law in local.items():
             groups = equations.file[units] if law.base == "file" else equations.night[units]
-            walks = law.base == "walk"
             for k, group in enumerate(np.unique(groups)):
-                members = groups == group
                 parameter.append(i)
-                covers.append(members)
-                priors.append((0.0, 0.0) if walks and (cells or k) else (mean[i], precision[i]))
-                times.append(equations.mjd[units][members].mean() if walks else np.nan)
+                covers.append(groups == group)
+                priors.append((0.0, 0.0) if law.base == "walk" and (cells or k) else (mean[i], precision[i]))
         acts = np.array(covers, float).reshape(-1, len(units))
-        centre, strength = np.array(priors, float).reshape(-1, 2).T
-        cells.append(Cell(units, np.array(parameter, int), acts, centre, strength, np.array(times, float)))
+        cells.append(Cell(units, np.array(parameter, int), acts, *np.array(priors, float).reshape(-1, 2).T))
     return tuple(cells)
 
 
@@ -290,9 +292,8 @@ class Solution:
         system = self.system
         values = np.zeros((len(system.equations), len(system.laws)))
         np.add.at(values.T, system.at, (system.basis * self.shared).T)
-        for cell, local in zip(system.cells, self.local, strict=True):
-            for k, i in enumerate(cell.parameter):
-                values[cell.units, i] += cell.covers[k] * local[k]
+        for c, k, i, units in system.locals:
+            values[units, i] += self.local[c][k]
         return values
 
     @functools.cached_property
@@ -324,20 +325,18 @@ class Solution:
         return cholesky_solve(self.factor, np.eye(len(self.shared)))
 
     @functools.cached_property
-    def smoothed(self) -> list[tuple[Matrix, Matrix, Matrix]]:
-        """Of every cell the covariance of its unknowns, that with the globals, and that with the next cell's."""
-        smoothed: list[tuple[Matrix, Matrix, Matrix]] = []
-        split = len(self.shared)
-        block, cross = np.zeros((0, 0)), np.zeros((0, split))  # of the next cell: none behind the last
+    def smoothed(self) -> list[tuple[Matrix, Matrix]]:
+        """Of every cell the covariance of its unknowns, and that with the globals and the unknowns of the next cell."""
+        smoothed: list[tuple[Matrix, Matrix]] = []
+        beside = self.covariance  # of the globals and the next cell: none behind the last
         for c in reversed(range(len(self.cells))):
             entry = self.cells[c]
-            coupling = self.cells[c + 1].before.T if smoothed else np.zeros((len(entry.right), 0))
-            joint = np.block([[self.covariance, cross.T], [cross, block]])
-            gain = cholesky_solve(entry.factor, np.hstack([entry.left, coupling]))
-            with_others = -gain @ joint
-            block = cholesky_solve(entry.factor, np.eye(len(entry.right))) - with_others @ gain.T
-            cross = with_others[:, :split]
-            smoothed.append((block, cross, with_others[:, split:]))
+            coupling = [self.cells[c + 1].before.T] if smoothed else []
+            gain = cholesky_solve(entry.factor, np.hstack([entry.left, *coupling]))
+            others = -gain @ beside
+            block = cholesky_solve(entry.factor, np.eye(len(entry.right))) - others @ gain.T
+            beside = _joined(self.covariance, block, others)
+            smoothed.append((block, others))
         return smoothed[::-1]
 
     def predict(self, mjd: float, night: int | None = None) -> tuple[Vector, Matrix]:
@@ -348,35 +347,40 @@ class Solution:
         are known in these alone, elsewhere they scatter as they do over the nights.
         """
         system, e, n = self.system, self.system.equations, len(self.system.laws)
+        here: dict[int, tuple[int, int]] = {}  # cell and place of the values of the unit at this time
+        if night is not None:
+            units = np.flatnonzero(e.night == night)
+            unit = units[np.argmin(np.abs(e.mjd[units] - mjd))]
+            here = {i: (c, k) for c, k, i, covered in system.locals if unit in covered}
         terms: list[tuple[int, int, int, float]] = []  # parameter, cell, place in it, weight
         extra, value, scattering = np.zeros(n), np.zeros(n), list[int]()
-        here: tuple[int, int] | None = None  # the cell of the night, and the place of its unit in it
-        for c, cell in enumerate(system.cells):
-            if night is not None and night in e.night[cell.units]:
-                away = np.where(e.night[cell.units] == night, np.abs(e.mjd[cell.units] - mjd), np.inf)
-                here = c, int(np.argmin(away))
         for i, law in enumerate(system.laws):
             if law is None or law.base not in LOCAL:
                 continue
             if law.base == "walk":
-                terms += self._bridge(i, mjd, extra)
-            elif here is not None:
-                cell = system.cells[here[0]]
-                (k,) = np.flatnonzero((cell.parameter == i) & (cell.covers[:, here[1]] > 0)).tolist()
-                terms.append((i, here[0], k, 1.0))
+                beside, extra[i] = self._bridge(i, mjd)
+                terms += beside
+            elif night is not None:
+                terms.append((i, *here[i], 1.0))
             elif np.isfinite(system.spread[i]):
-                extra[i] += system.spread[i] ** 2
+                extra[i] = system.spread[i] ** 2
             else:
                 value[i], extra[i] = self._elsewhere(i, mjd)
                 scattering.append(i)
-        design = np.zeros((n, len(self.shared) + len(terms)))
+        # The cells of a time are neighbours; their unknowns follow the globals, those of the later cell first.
+        cells = sorted({c for _, c, _, _ in terms}, reverse=True)
+        joint, first = self.covariance, {}
+        for c in cells:
+            first[c] = len(joint)
+            block, others = self.smoothed[c]
+            joint = _joined(joint, block, others)
+        design = np.zeros((n, len(joint)))
         design[system.at, np.arange(len(self.shared))] = system.functions(mjd)[0]
-        for k, (i, _, _, weight) in enumerate(terms):
-            design[i, len(self.shared) + k] = weight
+        for i, c, k, weight in terms:
+            design[i, first[c] + k] = weight
         design[scattering] = 0.0
-        local = np.array([self.local[c][k] for _, c, k, _ in terms])
-        value += design @ np.concatenate([self.shared, local])
-        covariance = design @ self._joint(terms) @ design.T
+        value += design @ np.concatenate([self.shared, *(self.local[c] for c in cells)])
+        covariance = design @ joint @ design.T
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
@@ -387,8 +391,7 @@ class Solution:
         in the values as well as beside them. The variance is that of the residuals, and of what was fitted.
         """
         system = self.system
-        cells = ((cell.units, cell.covers[cell.parameter == i] > 0) for cell in system.cells)
-        first = np.array([units[covers][0] for units, rows in cells for covers in rows])
+        first = np.array([units[0] for _, _, j, units in system.locals if j == i])
         functions = np.vstack([system.basis[first], system.functions(mjd)])[:, system.at == i]
         functions = np.column_stack([np.ones(len(functions)), functions])
         design, here, values = functions[:-1], functions[-1], self.values[first, i]
@@ -398,37 +401,18 @@ class Solution:
         scatter = float(np.sum((values - design @ coefficients) ** 2)) / free if free > 0 else np.inf
         return float(here @ coefficients), scatter * (1.0 + float(here @ inverse @ here))
 
-    def _bridge(self, i: int, mjd: float, extra: Vector) -> list[tuple[int, int, int, float]]:
-        """The states beside a time with their weights; the variance of the walk between them is added to `extra`."""
-        states, rate = self.system.states[i], self.system.rates[i]
+    def _bridge(self, i: int, mjd: float) -> tuple[list[tuple[int, int, int, float]], float]:
+        """The states beside a time with their weights, and the variance of the walk between them."""
+        states, variance = self.system.states[i], self.system.rates[i] ** 2
         times = [time for time, _, _ in states]
         after = int(np.searchsorted(times, mjd))
         if after in (0, len(times)):
             time, c, k = states[min(after, len(times) - 1)]
-            extra[i] += rate**2 * abs(mjd - time)
-            return [(i, c, k, 1.0)]
+            return [(i, c, k, 1.0)], variance * abs(mjd - time)
         (start, *before), (stop, *behind) = states[after - 1], states[after]
         share = (mjd - start) / (stop - start)
-        extra[i] += rate**2 * (mjd - start) * (1.0 - share)
-        return [(i, before[0], before[1], 1.0 - share), (i, behind[0], behind[1], share)]
-
-    def _joint(self, parts: Sequence[tuple[int, int, int, float]]) -> Matrix:
-        """Covariance of the globals and of unknowns of at most two neighbouring cells."""
-        size = len(self.shared)
-        joint = np.zeros((size + len(parts), size + len(parts)))
-        joint[:size, :size] = self.covariance
-        for a, (_, c, k, _) in enumerate(parts):
-            block, cross, after = self.smoothed[c]
-            joint[size + a, :size] = joint[:size, size + a] = cross[k]
-            for b, (_, d, m, _) in enumerate(parts[: a + 1]):
-                if c == d:
-                    value = block[k, m]
-                elif d == c + 1:
-                    value = after[k, m]
-                else:
-                    value = self.smoothed[d][2][m, k]
-                joint[size + a, size + b] = joint[size + b, size + a] = value
-        return joint
+        weighted = [(i, before[0], before[1], 1.0 - share), (i, behind[0], behind[1], share)]
+        return weighted, variance * (mjd - start) * (1.0 - share)
 
     def errors(self) -> OfUnits:
         """Standard errors of the parameters in every unit, scaled."""
@@ -437,9 +421,14 @@ class Solution:
         same = system.at[:, None] == system.at  # globals of one parameter
         of_globals = system.basis * (system.basis @ (self.covariance * same))
         np.add.at(variance.T, system.at, of_globals.T)
-        for cell, (block, cross, _) in zip(system.cells, self.smoothed, strict=True):
-            for k, i in enumerate(cell.parameter):
-                units = cell.units[cell.covers[k] > 0]
-                with_globals = system.basis[units] @ np.where(system.at == i, cross[k], 0.0)
-                variance[units, i] += block[k, k] + 2.0 * with_globals
+        for c, k, i, units in system.locals:
+            block, others = self.smoothed[c]
+            with_globals = system.basis[units] @ np.where(system.at == i, others[k, : len(self.shared)], 0.0)
+            variance[units, i] += block[k, k] + 2.0 * with_globals
         return np.sqrt(np.clip(variance, 0.0, None))
+
+
+def _joined(covariance: Matrix, block: Matrix, others: Matrix) -> Matrix:
+    """A covariance with that of further unknowns, `block`; `others` is theirs with the first ones, and maybe more."""
+    cross = others[:, : len(covariance)]
+    return np.block([[covariance, cross.T], [cross, block]])

@@ -29,7 +29,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Form, Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
-from walop_jax.nights.algebra import Solution, System, UndeterminedError, solve
+from walop_jax.nights.algebra import Laws, Solution, System, UndeterminedError, solve
 from walop_jax.nights.equations import EffectAmplitude, Together
 
 CHANCE = 0.005  # of any break in a series that has none: half of one in a hundred
@@ -40,7 +40,6 @@ MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
 Carried = Callable[[Parameter], bool]  # true for a candidate that stars can be corrected for
-Laws = Sequence[Law | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,15 +119,14 @@ class Tried(NamedTuple):
     @classmethod
     def of(cls, solution: Solution, barred: Sequence[int] = ()) -> Tried:
         """Scores of all changes; of those of `barred` parameters there is no information."""
-        scan, e = changes.scan(solution), solution.system.equations
-        n = len(solution.system.laws)
-        course = np.repeat(((e.mjd - e.mjd.mean()) / YEAR)[:, None], n, axis=1)
-        drift_score, drift_information = changes.weighted(solution, course, np.arange(n))
-        scores = scan.step_score, scan.once_score, drift_score[None]
-        information = scan.step_information, scan.once_information, np.diag(drift_information)[None].copy()
+        mjd, n = solution.system.equations.mjd, len(solution.system.laws)
+        course = np.repeat(((mjd - mjd.mean()) / YEAR)[:, None], n, axis=1)
+        drift, of_drift = changes.weighted(solution, course, np.arange(n))
+        scores, known = changes.scan(solution)
+        information = *known, np.diag(of_drift)[None].copy()
         for of_kind in information:
             of_kind[:, list(barred)] = 0.0
-        return cls(scores, information)
+        return cls((*scores, drift[None]), information)
 
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
@@ -169,8 +167,8 @@ def solved(data: Together, laws: Laws) -> Solution:
 
 def find(
     data: Together, laws: Laws, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
-) -> tuple[tuple[Break, ...], tuple[Law | None, ...], Solution]:
-    """The breaks of a series, the laws with them, and the solution under these.
+) -> tuple[tuple[Break, ...], tuple[Law | None, ...]]:
+    """The breaks of a series, and the laws with them. Raises `UndeterminedError` where there is no solution.
 
     Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
     """
@@ -192,8 +190,7 @@ def find(
     for k, candidate in enumerate(breaks):
         laws_of_others = with_breaks(data, laws, breaks[:k] + breaks[k + 1 :])
         breaks[k] = dataclasses.replace(candidate, held_out=_held_out(data, laws_of_others, candidate))
-    chosen = with_breaks(data, laws, breaks)
-    return tuple(sorted(breaks, key=lambda candidate: candidate.night)), chosen, solved(data, chosen)
+    return tuple(sorted(breaks, key=lambda candidate: candidate.night)), with_breaks(data, laws, breaks)
 
 
 def at_solution(data: Together, solution: Solution, one: Break) -> Break:

@@ -10,8 +10,6 @@ z = s/√I is the change in its standard errors with everything else fitted anew
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import linalg
@@ -19,18 +17,6 @@ from scipy import linalg
 from walop_jax.nights.algebra import Matrix, Solution, Vector, cholesky_solve
 
 NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
-
-
-class Scan(NamedTuple):
-    """Scores and informations of changes of every parameter (n), from every cell on, and in every cell alone (c).
-
-    The information is 0 where the laws take the change up. Scaled as the equations.
-    """
-
-    step_score: Float[np.ndarray, "c n"]
-    step_information: Float[np.ndarray, "c n"]
-    once_score: Float[np.ndarray, "c n"]
-    once_information: Float[np.ndarray, "c n"]
 
 
 def _information(
@@ -44,12 +30,15 @@ def _information(
     return np.where(remaining > NOTHING * np.maximum(own, 1e-300), remaining, 0.0)
 
 
-def scan(of: Solution) -> Scan:
-    """The changes of every parameter and candidate at every cell."""
+def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2 c n"]]:
+    """Scores and informations of changes of every parameter (n): from every cell (c) on, then in every cell alone.
+
+    The information is 0 where the laws take the change up. Scaled as the equations.
+    """
     system, e = of.system, of.system.equations
     n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
-    scores = Scan(*(np.zeros((count, n)) for _ in range(4)))
-    cross, information, score = np.zeros((globals_, n)), np.zeros(n), np.zeros(n)
+    score, information = np.zeros((2, count, n)), np.zeros((2, count, n))
+    cross, own = np.zeros((globals_, n)), np.zeros(n)
     absorbed, border_taken = np.zeros(n), np.zeros((globals_, n))
     behind: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
     for c in reversed(range(count)):
@@ -61,10 +50,8 @@ def scan(of: Solution) -> Scan:
             cross_here += system.basis[unit][:, None] * matrix[system.at]
             local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
             mine += np.diag(matrix)
-        cross, information = cross + cross_here, information + mine
-        scores.once_score[c] = -of.slopes[cell.units].sum(axis=0)
-        score = score + scores.once_score[c]
-        scores.step_score[c] = score
+        cross, own = cross + cross_here, own + mine
+        score[:, c] = -of.slopes[cell.units].sum(axis=0)
         block, border, moved = entry.block, entry.border, local
         if behind is not None:
             factor, border_behind, moved_behind = behind
@@ -78,17 +65,18 @@ def scan(of: Solution) -> Scan:
         solved = cholesky_solve(joint, moved)
         taken = absorbed + np.einsum("kn,kn->n", moved, solved)
         beyond = cross - border_taken - sides.T @ solved
-        scores.step_information[c] = _information(of, information, beyond, taken)
+        information[0, c] = _information(of, own, beyond, taken)
         solved = cholesky_solve(joint, local)
         taken = np.einsum("kn,kn->n", local, solved)
-        scores.once_information[c] = _information(of, mine, cross_here - sides.T @ solved, taken)
+        information[1, c] = _information(of, mine, cross_here - sides.T @ solved, taken)
         factor = linalg.cho_factor(block, lower=True, check_finite=False)
         solved = cholesky_solve(factor, moved)
         absorbed = absorbed + np.einsum("kn,kn->n", moved, solved)
         border_taken = border_taken + border.T @ solved
         behind = factor, border, moved
-    scores.step_information[0] = 0.0  # from the first night on is no change
-    return scores
+    score[0] = np.cumsum(score[0, ::-1], axis=0)[::-1]
+    information[0, 0] = 0.0  # from the first night on is no change
+    return score, information
 
 
 def weighted(

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet, Exposures, Site
@@ -38,7 +38,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model, effect_context
-from walop_jax.nights.algebra import Equations
+from walop_jax.nights.algebra import Equations, Matrix, Vector
 from walop_jax.sky.moon import local_sidereal_time
 from walop_jax.sky.nights import night_of
 
@@ -48,8 +48,6 @@ MOST_SHAPES = 4  # of an effect whose shapes are all candidates: cameras, plates
 OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make
 SIDEREAL = 1.00273791  # sidereal hours in an hour
 CLOCK = 0.2, 0.05  # hours by which hour angles disagree with MJD, and their scatter: signs of another clock
-
-Vector = Float[np.ndarray, " _"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,17 +92,6 @@ class Night:
 # ------------------------------------------------------------------------------------------------ nights of a set
 
 
-def night_numbers(mjd: Float[np.ndarray, " e"], site: Site) -> Int[np.ndarray, " e"]:
-    """The night of every exposure: MJD of its evening at the site. `mjd` is UTC.
-
-    Raises `DataError` for an exposure without a time.
-    """
-    if np.any(bad := ~np.isfinite(mjd)):
-        what = f"not given in {int(bad.sum())} of {len(mjd)} exposures, so that they belong to no night"
-        raise DataError(f"[EXPOSURES] MJD: {what}; add the times (UTC)")
-    return night_of(mjd, site.longitude).astype(int)
-
-
 def check_clock(exposures: Exposures, site: Site) -> None:
     """Raise `DataError` where the hour angles of the sky exposures say that MJD is not UTC: clocks in local time."""
     sky = np.isfinite(exposures.mjd + exposures.ha + exposures.ra) & (exposures.kind != "clp")
@@ -135,10 +122,14 @@ def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> Calibr
 
 def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
     """The nights of a set, each with its number. Raises `DataError` for times that are missing or not UTC."""
+    mjd = calset.exposures.mjd
     check_clock(calset.exposures, calset.site)
-    numbers = night_numbers(calset.exposures.mjd, calset.site)
-    for number in np.unique(numbers).tolist():
-        yield number, of_exposures(calset, numbers == number)
+    if missing := int((~np.isfinite(mjd)).sum()):
+        what = f"not given in {missing} of {len(mjd)} exposures, so that they belong to no night"
+        raise DataError(f"[EXPOSURES] MJD: {what}; add the times (UTC)")
+    numbers = night_of(mjd, calset.site.longitude)
+    for number in np.unique(numbers):
+        yield int(number), of_exposures(calset, numbers == number)
 
 
 # ------------------------------------------------------------------------------------------------------ candidates
@@ -161,9 +152,9 @@ class EffectAmplitude(Parameter):
     def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
         """That of a leaf of a probe; `group` is None where the effect has a single one."""
         of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
-        name = f"{effect}{of_group}.{leaf.name}{of_member}"
-        fields: dict[str, Any] = vars(leaf) | {"name": name, "part": effect, "start": 0.0}
-        return cls(**fields, shape=(group or 0, member), in_model=f"{effect}.{leaf.name}")
+        return cls.read(
+            dataclasses.replace(leaf, name=f"{effect}{of_group}.{leaf.name}{of_member}", start=0.0)
+        )
 
     @classmethod
     def read(cls, parameter: Parameter) -> EffectAmplitude:
@@ -204,7 +195,7 @@ def candidates_of(
 
 def with_candidates(
     likelihood: Likelihood, values: Vector, candidates: Candidates
-) -> tuple[float, Vector, Float[np.ndarray, "_ _"]]:
+) -> tuple[float, Vector, Matrix]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     model = likelihood.model
     changes = [change for _, change in candidates.values()]

@@ -1,6 +1,6 @@
 """Nights made of data: linearised near their own minimum first, at a common solution later; here or on other machines.
 
-`make` needs nothing but its arguments, so that any `concurrent.futures.Executor` runs it: one of processes, or that of
+A `Maker` needs nothing but its tasks, so that any `concurrent.futures.Executor` runs it: one of processes, or that of
 a Dask cluster (`distributed.Client.get_executor`). Nights depend neither on the process nor on their order. The file
 of a night appears in `folder`, whole or not at all; a night with a file is not made again.
 """
@@ -162,12 +162,8 @@ def made(maker: Maker, executor: Executor | None, tasks: Sequence[Task]) -> Iter
 
     Raises `DataError` as `Maker.make` does, and for measurements that are in the data of an earlier task as well.
     """
-    results: Iterable[Made] = map(maker.make, tasks)
-    if executor is not None:
-        recipe = pickle.dumps((maker.like, maker.folder, maker.count))
-        results = mapped(make, [(recipe, task) for task in tasks], executor)
     seen: dict[int, str] = {}
-    for result in results:
+    for result in mapped(maker.make, tasks, executor):
         shared = Counter(seen[number] for number in result.sketch if number in seen)
         if shared and (closest := shared.most_common(1)[0])[1] > COPIED * len(result.sketch):
             what = f"{100 * closest[1] / len(result.sketch):.0f} % of its measurements are in {closest[0]} as well"
@@ -180,18 +176,6 @@ def made(maker: Maker, executor: Executor | None, tasks: Sequence[Task]) -> Iter
         yield result.nights
 
 
-def make(given: tuple[bytes, Task]) -> Made:
-    """The nights of a task, made in any process by `Maker(*recipe)`."""
-    recipe, task = given
-    return _maker(recipe).make(task)
-
-
-@functools.lru_cache(maxsize=1)
-def _maker(recipe: bytes) -> Maker:
-    """The maker of a worker process, with the sets that it has read and the candidates that it has listed."""
-    return Maker(*pickle.loads(recipe))
-
-
 def mapped(
     function: Callable[[Given], Done], tasks: Sequence[Given], executor: Executor | None
 ) -> Iterable[Done]:
@@ -200,15 +184,20 @@ def mapped(
         return map(function, tasks)
     if not tasks:
         return ()
-    start = os.getpid(), files_of_users()
-    work = [pickle.dumps((function, task)) for task in tasks]
-    return executor.map(_there, [start] * len(work), work)
+    common = (os.getpid(), files_of_users()), pickle.dumps(function)
+    return executor.map(_there, [common] * len(tasks), list(map(pickle.dumps, tasks)))
 
 
-def _there(start: tuple[int, tuple[str, ...]], work: bytes) -> Any:
+def _there(common: tuple[tuple[int, tuple[str, ...]], bytes], task: bytes) -> Any:
+    start, function = common
     _prepare(*start)
-    function, task = pickle.loads(work)
-    return function(task)
+    return _loaded(function)(pickle.loads(task))
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(function: bytes) -> Callable[[Any], Any]:
+    """A function in a worker process, with what its object has read and listed there."""
+    return pickle.loads(function)
 
 
 @functools.lru_cache(maxsize=1)

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration, write_calibration
@@ -36,7 +35,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import Law, laws_of, resolved
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import effect_context
-from walop_jax.nights.algebra import Solution, UndeterminedError
+from walop_jax.nights.algebra import Laws, OfUnits, Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, at_solution, solved
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
@@ -45,10 +44,8 @@ from walop_jax.nights.night_file import nights_in, read_nights, write_nights
 from walop_jax.nights.survey import Survey
 from walop_jax.posterior.run import Run
 
-Laws = Sequence[Law | None]
 AtHand = Mapping[tuple[str, int], Data]
 Make = Callable[[Sequence[Task]], Iterator[list[Night]]]
-OfUnits = Float[np.ndarray, "u n"]
 
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
@@ -125,7 +122,7 @@ def stack(
         if find and len({night.number for night in data.nights}) > 2:
             # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.
             carried = functools.partial(_carried, maker.like, catalogue) if maker.like is not None else None
-            new_breaks, chosen, _ = breaks_of(data, chosen, catalogue, carried)
+            new_breaks, chosen = breaks_of(data, chosen, catalogue, carried)
             breaks += new_breaks
         before = data.reference
         data, solution, settled = _settled(data, chosen, at_hand, make)

@@ -30,14 +30,13 @@ from walop_jax.io.text import two_digits, value_and_error
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.nights.algebra import Solution
+from walop_jax.nights.algebra import Matrix, Solution, Vector
 from walop_jax.nights.breaks import Break
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import EffectAmplitude, Together, night_numbers
+from walop_jax.nights.equations import EffectAmplitude, Together
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
+from walop_jax.sky.nights import night_of
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "n n"]
 OfMatrix = tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float]
 
 HALF_A_DAY = 0.5
@@ -208,7 +207,7 @@ class Survey(Drawn):
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
         nights, scale = self.data.nights, self.data.equations.scale
         if self.like is not None and np.isfinite(self.like.site.longitude):
-            number = int(night_numbers(np.array([mjd], float), self.like.site)[0])
+            number = int(night_of(np.array([mjd], float), self.like.site.longitude)[0])
         else:
             number = next((n.number for n in nights if n.begin <= mjd <= n.end), -1)
         evenings = sorted({n.number for n in nights})
@@ -292,12 +291,13 @@ class Survey(Drawn):
         were free to differ there, with everything else fitted anew; NaN where its law takes that up.
         """
         data, solution = self.data, self.solution
-        shape, scale, scores = (len(data.nights), len(data.names)), data.equations.scale, scan(self.solution)
+        shape, scale = (len(data.nights), len(data.names)), data.equations.scale
         cell_of = np.zeros(len(data.nights), int)
         for c, cell in enumerate(solution.system.cells):
             cell_of[cell.units] = c
-        information = np.where(scores.once_information > 0, scores.once_information, np.nan)[cell_of]
-        deviation, alone = scores.once_score[cell_of] / information, information**-0.5
+        score, information = (of_kinds[1, cell_of] for of_kinds in scan(solution))
+        information = np.where(information > 0, information, np.nan)
+        deviation, alone = score / information, information**-0.5
         laws = ["absent" if law is None else " ".join(law.per) for law in self.laws]
         night, parameter = np.indices(shape).reshape(2, -1)  # of every row
         values, errors = data.origin + solution.values * scale, solution.errors() * scale
