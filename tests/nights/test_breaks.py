@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from walop_jax.data.user_tables import in_memory
+from walop_jax.io.errors import DataError
 from walop_jax.model.effects.change import Change
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights import breaks
+from walop_jax.nights import breaks, stacking
 from walop_jax.nights.algebra import Equations
-from walop_jax.nights.equations import EffectAmplitude, Night, Together
+from walop_jax.nights.equations import EffectAmplitude, Night, Together, together
+from walop_jax.nights.survey import Survey
 
 N, NIGHTS, RATE = 6, 60, 0.05
 LAWS = (Law(("walk",), rate=RATE), Law(), Law(), Law(), Law(("night",), spread=0.2), None)
@@ -66,6 +69,24 @@ def test_the_largest_of_quiet_series_is_as_the_bound_says():
         beyond, most = np.sum(np.array(largest) > u), tried.chance(u)
         assert stats.binom.sf(beyond - 1, 100, most) > 1e-3
         assert stats.binom.cdf(beyond, 100, 0.4 * most) > 1e-3
+
+
+@pytest.mark.parametrize("u", [3.5, 4.5])
+def test_the_bound_of_three_nights_is_a_bound(u):
+    """A candidate that three equal nights see: five changes that differ, of known correlations (Bonferroni 1936)."""
+    number, no = np.arange(3), np.zeros((3, 2))
+    e = Equations(61000.0 + number, number, number, no[:, 0], no, np.tile(np.eye(2), (3, 1, 1)), np.ones(2))
+    data = dataclasses.replace(
+        series(0), equations=e, mean=no[0], width=no[0] + np.inf, parameters=series(0).parameters[4:]
+    )
+    tried = breaks.Tried.of(breaks.solved(data, (Law(), None)), barred=[0])
+    single = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [-1, 0, 1]]) / np.sqrt(
+        [[1], [1], [1], [2], [2]]
+    )
+    correlation = single @ single.T
+    both = breaks.both_beyond(u, correlation[np.triu_indices(5, 1)])
+    total = 5.0 * 2.0 * stats.norm.sf(u)
+    assert total - both.sum() < tried.chance(u) < total
 
 
 def test_a_step_a_bad_night_and_a_drift():
@@ -164,3 +185,85 @@ def test_the_size_of_a_step_between_two_intervals_is_the_difference_of_their_val
         sizes.append((one.size, one.error))
     # With an edge that nothing happens at, less data show what was before: the error is larger.
     assert sizes[1][1] > sizes[0][1]
+
+
+def step_before_night_40(data):
+    """A step of p1.x."""
+    last, first = data.nights[39:41]
+    span = (first.number, first.number)
+    return breaks.Break(
+        "step", "p1.x", "deg", 2.0, 0.1, 20.0, 1e-9, first.number, span, last.end, first.begin
+    )
+
+
+def test_between_the_nights_of_a_step_it_has_happened_or_not():
+    """With probability q: mean and covariance are those of the mixture of both (law of total covariance)."""
+    change = np.zeros((NIGHTS, N))
+    change[40:, 1] = 1.2
+    data = series(7, change)
+    step = step_before_night_40(data)
+    laws = breaks.with_breaks(data, (Law(),) * 5 + (None,), [step])
+    solution = breaks.solved(data, laws)
+    step = breaks.at_solution(data, solution, step)
+    survey = Survey(data, laws, solution, breaks=(step,))
+    (early, of_early), (late, of_late) = map(survey.values_at, (step.before, step.after))
+    away = late - early
+    for q in (0.1, 0.45, 0.55, 0.9):
+        value, covariance = survey.values_at(step.before + q * (step.after - step.before))
+        assert value == pytest.approx((1.0 - q) * early + q * late, rel=1e-9, abs=1e-12)
+        mixture = (1.0 - q) * of_early + q * of_late + q * (1.0 - q) * np.outer(away, away)
+        np.testing.assert_allclose(covariance, mixture, rtol=1e-7, atol=1e-9 * np.abs(mixture).max())
+
+
+def test_a_break_that_is_no_law_changes_nothing():
+    """One that a survey of other laws had."""
+    data = series(0)
+    step = step_before_night_40(data)
+    solution = breaks.solved(data, LAWS)
+    survey, plain = (Survey(data, LAWS, solution, breaks=found) for found in ((step,), ()))
+    mjd = step.before + 0.4 * (step.after - step.before)
+    for one, other in zip(survey.values_at(mjd), plain.values_at(mjd), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def nightly():
+    """A survey of nights with values of their own, at no known place, and its first two nights in a row."""
+    data = series(0)
+    k = next(k for k in range(NIGHTS) if data.nights[k + 1].mjd - data.nights[k].mjd == 1.0)
+    return Survey(data, LAWS, breaks.solved(data, LAWS)), data.nights[k], data.nights[k + 1]
+
+
+def test_stars_of_a_night_have_its_values_before_and_after_its_calibration():
+    """Without a longitude as well: noon is in the middle of the longest part of the day without an exposure."""
+    survey, night, other = nightly()
+    in_it, _ = survey.values_at(night.mjd)
+    for mjd in (night.begin - 0.05, night.end + 0.2):
+        assert survey.values_at(mjd)[0][4] == in_it[4]
+    assert survey.values_at(other.begin - 0.05)[0][4] == survey.values_at(other.mjd)[0][4] != in_it[4]
+
+
+def test_stars_of_two_nights_with_values_of_their_own_are_refused():
+    """Less than a day apart, they have no calibration in common."""
+    survey, night, other = nightly()
+    stars = in_memory({"MJD": [night.end + 0.1, other.begin - 0.01]})
+    with pytest.raises(DataError, match=r"MJD.*spans two nights.*give a catalogue for every night"):
+        stacking.calibration_of_stars(survey, stars)
+
+
+def test_a_night_is_not_far_from_what_it_does_not_see():
+    """A star that was seen in other nights alone, and is far from where these were linearised."""
+    change = np.zeros((NIGHTS, N))
+    change[:, 1] = 50.0
+    keep = np.delete(np.arange(N), 1)
+    blind = range(0, NIGHTS, 2)
+    nights = list(series(7, change).nights)
+    for k, night in zip(blind, (series(7).nights[k] for k in blind), strict=True):
+        nights[k] = dataclasses.replace(
+            night, parameters=tuple(night.parameters[i] for i in keep), reference=night.reference[keep],
+            gradient=night.gradient[keep], matrix=night.matrix[np.ix_(keep, keep)],
+        )  # fmt: skip
+    data = together(nights)
+    laws = [law and Law() for law in stacking.laws_of_all(data, {})]
+    at_hand = dict.fromkeys((night.key for night in data.nights), stacking.Data(None, ""))
+    away = stacking._distances(data, breaks.solved(data, laws), data.reference, at_hand)
+    assert max(away[k] for k in blind) < 20.0 < 200.0 < min(away[k] for k in range(1, NIGHTS, 2))

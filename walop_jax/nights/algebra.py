@@ -339,14 +339,18 @@ class Solution:
             smoothed.append((block, others))
         return smoothed[::-1]
 
-    def predict(self, mjd: float, night: int | None = None) -> tuple[Vector, Matrix]:
+    def predict(
+        self, mjd: float, night: int | None = None, moved: Vector | float = 0.0
+    ) -> tuple[Vector, Matrix]:
         """All parameters at a time (MJD), from the origin, scaled, and their covariance.
 
-        `night` is the number of the night that the time belongs to, None for one without equations. A walk is
-        interpolated between nights (a Brownian bridge) and goes on behind the last; values of single nights and files
-        are known in these alone, elsewhere they scatter as they do over the nights.
+        `night` is the number of the night that the time belongs to, None for one without equations; `moved` is added
+        to the functions of time of the globals. A walk is interpolated between nights (a Brownian bridge) and goes on
+        behind the last; values of single nights and files are known in these alone, elsewhere they scatter as they do
+        over the nights.
         """
         system, e, n = self.system, self.system.equations, len(self.system.laws)
+        functions = system.functions(mjd)[0] + moved
         here: dict[int, tuple[int, int]] = {}  # cell and place of the values of the unit at this time
         if night is not None:
             units = np.flatnonzero(e.night == night)
@@ -365,7 +369,7 @@ class Solution:
             elif np.isfinite(system.spread[i]):
                 extra[i] = system.spread[i] ** 2
             else:
-                value[i], extra[i] = self._elsewhere(i, mjd)
+                value[i], extra[i] = self._elsewhere(i, functions)
                 scattering.append(i)
         # The cells of a time are neighbours; their unknowns follow the globals, those of the later cell first.
         cells = sorted({c for _, c, _, _ in terms}, reverse=True)
@@ -375,7 +379,7 @@ class Solution:
             block, others = self.smoothed[c]
             joint = _joined(joint, block, others)
         design = np.zeros((n, len(joint)))
-        design[system.at, np.arange(len(self.shared))] = system.functions(mjd)[0]
+        design[system.at, np.arange(len(self.shared))] = functions
         for i, c, k, weight in terms:
             design[i, first[c] + k] = weight
         design[scattering] = 0.0
@@ -384,15 +388,15 @@ class Solution:
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
-    def _elsewhere(self, i: int, mjd: float) -> tuple[float, float]:
-        """A value of single nights or files at a time without data, and its variance.
+    def _elsewhere(self, i: int, at_time: Vector) -> tuple[float, float]:
+        """A value of single nights or files where no data are, the globals having these functions, and its variance.
 
         Least squares of the values in a constant and the steps, bad nights and trends of the parameter: these may be
         in the values as well as beside them. The variance is that of the residuals, and of what was fitted.
         """
         system = self.system
         first = np.array([units[0] for _, _, j, units in system.locals if j == i])
-        functions = np.vstack([system.basis[first], system.functions(mjd)])[:, system.at == i]
+        functions = np.vstack([system.basis[first], at_time])[:, system.at == i]
         functions = np.column_stack([np.ones(len(functions)), functions])
         design, here, values = functions[:-1], functions[-1], self.values[first, i]
         inverse = pseudo_inverse(design.T @ design, 1e-12)

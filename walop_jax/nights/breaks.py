@@ -111,10 +111,14 @@ def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k
 
 
 class Tried(NamedTuple):
-    """All changes of a solution: score and information by kind, cell and parameter (drifts have one cell)."""
+    """All changes of a solution: score and information by kind, cell and parameter (drifts have one cell).
+
+    A value in all nights is no change, of which `always` is the information.
+    """
 
     score: tuple[Float[np.ndarray, "_ n"], ...]
     information: tuple[Float[np.ndarray, "_ n"], ...]
+    always: Float[np.ndarray, " n"]
 
     @classmethod
     def of(cls, solution: Solution, barred: Sequence[int] = ()) -> Tried:
@@ -123,10 +127,11 @@ class Tried(NamedTuple):
         course = np.repeat(((mjd - mjd.mean()) / YEAR)[:, None], n, axis=1)
         drift, of_drift = changes.weighted(solution, course, np.arange(n))
         scores, known = changes.scan(solution)
+        always, known[0, 0] = known[0, 0].copy(), 0.0
         information = *known, np.diag(of_drift)[None].copy()
         for of_kind in information:
             of_kind[:, list(barred)] = 0.0
-        return cls((*scores, drift[None]), information)
+        return cls((*scores, drift[None]), information, always)
 
     def z(self, kind: int) -> Float[np.ndarray, "_ n"]:
         """Changes of a kind in their standard errors; 0 where the laws take them up."""
@@ -140,14 +145,14 @@ class Tried(NamedTuple):
         total = single * sum(int((information > 0).sum()) for information in self.information)
         if u < 3.0:
             return 1.0
-        after = np.vstack([step[1:], np.zeros_like(step[:1])])
+        whole, after = np.vstack([self.always, step[1:]]), np.vstack([step[1:], np.zeros_like(step[:1])])
 
         def correlation(first: Any, second: Any, between: Any) -> Any:
             product = first * second
             correlations = (first + second - between) / (2.0 * np.sqrt(np.where(product > 0, product, 1.0)))
             return np.where(product > 0, np.abs(correlations), 0.0)
 
-        beside = np.maximum(correlation(step, once, after), correlation(after, once, step))
+        beside = np.maximum(correlation(step, once, after), correlation(after, once, whole))
         rho = np.concatenate([correlation(step, after, once).ravel(), beside.ravel()])
         rho = np.minimum(rho[rho > 0.5], 1.0)
         return float(min(1.0, max(total - both_beyond(u, rho).sum(), single)))
@@ -193,20 +198,25 @@ def find(
     return tuple(sorted(breaks, key=lambda candidate: candidate.night)), with_breaks(data, laws, breaks)
 
 
-def at_solution(data: Together, solution: Solution, one: Break) -> Break:
-    """A break with the size that a solution under its law gives it."""
+def among_globals(data: Together, solution: Solution, one: Break) -> Float[np.ndarray, " g"]:
+    """The size of a break as a sum of global unknowns, by their weights: zeros where no law has it."""
     system, i = solution.system, data.names.index(one.name)
-    form, scale = one.form(float(data.equations.mjd.mean())), float(data.equations.scale[i])
+    form, law = one.form(float(data.equations.mjd.mean())), system.laws[i]
     forms = [entry.form if entry.parameter == i else None for entry in system.globals]
     change = np.array([float(f is not None and (f.kind, f.start) == (form.kind, form.start)) for f in forms])
+    # Intervals have values before and after, and no change.
+    if change.any() and one.kind == "step" and law is not None and law.base == "interval":
+        change -= [f is not None and f.stop == form.start for f in forms]
+    return change
+
+
+def at_solution(data: Together, solution: Solution, one: Break) -> Break:
+    """A break with the size that a solution under its law gives it."""
+    change, scale = among_globals(data, solution, one), data.equations.scale[data.names.index(one.name)]
     if not change.any():
         return one
-    law = system.laws[i]
-    # Intervals have values before and after, and no change.
-    if one.kind == "step" and law is not None and law.base == "interval":
-        change -= [f is not None and f.stop == form.start for f in forms]
-    error = scale * math.sqrt(change @ solution.covariance @ change)
-    return dataclasses.replace(one, size=scale * float(change @ solution.shared), error=error)
+    size, error = change @ solution.shared, math.sqrt(change @ solution.covariance @ change)
+    return dataclasses.replace(one, size=float(scale * size), error=float(scale * error))
 
 
 def with_breaks(data: Together, laws: Laws, found: Sequence[Break]) -> tuple[Law | None, ...]:

@@ -33,7 +33,8 @@ def _information(
 def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2 c n"]]:
     """Scores and informations of changes of every parameter (n): from every cell (c) on, then in every cell alone.
 
-    The information is 0 where the laws take the change up. Scaled as the equations.
+    From the first cell on is a value in all nights. The information is 0 where the laws take the change up. Scaled as
+    the equations.
     """
     system, e = of.system, of.system.equations
     n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
@@ -75,7 +76,6 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
         border_taken = border_taken + border.T @ solved
         behind = factor, border, moved
     score[0] = np.cumsum(score[0, ::-1], axis=0)[::-1]
-    information[0, 0] = 0.0  # from the first night on is no change
     return score, information
 
 

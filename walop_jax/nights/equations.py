@@ -387,8 +387,9 @@ class Together:
 
     @property
     def reference(self) -> Float[np.ndarray, "u n"]:
-        """The values that every night was linearised at; the origin for parameters that a night lacks."""
-        values, place = np.tile(self.origin, (len(self.nights), 1)), {n: k for k, n in enumerate(self.names)}
+        """The values that every night was linearised at, NaN for parameters that it lacks."""
+        place = {name: k for k, name in enumerate(self.names)}
+        values = np.full((len(self.nights), len(place)), np.nan)
         for u, night in enumerate(self.nights):
             values[u, [place[name] for name in night.names]] = night.reference
         return values

@@ -195,8 +195,8 @@ def is_survey(given: Any) -> TypeGuard[str | os.PathLike[str]]:
 def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = False) -> Calibration:
     """The calibration for stars of one day (MJD, UTC).
 
-    Raises `DataError` for stars without a time, of more than a day, on both sides of a change, and, unless `force` is
-    given, outside the validity.
+    Raises `DataError` for stars without a time, of more than a day, on both sides of a change, of two nights with
+    values of their own, and, unless `force` is given, outside the validity.
     """
     place, mjd = Place(stars.path, ""), numeric_column(stars, "MJD", EXPOSURES["MJD"])
     advice = "add the times (UTC) of the exposures, or give one calibration.fits for all"
@@ -207,6 +207,9 @@ def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = Fal
         raise place.fail(f"spans {high - low:.1f} days", "MJD", advice)
     if changed := [edge for edge in survey.edges if low < edge <= high]:
         raise place.fail(f"the instrument changed between the stars, at {changed[0]:.3f}", "MJD", advice)
+    of_single_nights = any(law.base in ("night", "file") for law in survey.changing.values())
+    if of_single_nights and survey.night_at(low) != survey.night_at(high):
+        raise place.fail("spans two nights, each of which has values of its own", "MJD", advice)
     for moment in (low, high):
         survey.at(moment, force=force)
     return survey.at(0.5 * (low + high), force=force)
@@ -261,7 +264,7 @@ def _distances(data: Together, solution: Solution, references: OfUnits, at_hand:
     """Distances (standard errors) of nights whose data are at hand, from references to a solution, largest first."""
     values, sigma = _in_units(data, solution)
     # Candidates have no place in the model: their part stays first-order, at 0.
-    away = (np.abs(values - references) / sigma)[:, data.has_value].max(axis=1)
+    away = np.nanmax((np.abs(values - references) / sigma)[:, data.has_value], axis=1)
     order = np.argsort(-away, kind="stable").tolist()
     return {u: float(away[u]) for u in order if data.nights[u].key in at_hand}
 

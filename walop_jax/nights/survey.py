@@ -31,7 +31,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Matrix, Solution, Vector
-from walop_jax.nights.breaks import Break
+from walop_jax.nights.breaks import Break, among_globals
 from walop_jax.nights.changes import scan
 from walop_jax.nights.equations import EffectAmplitude, Together
 from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
@@ -203,23 +203,27 @@ class Survey(Drawn):
         like = dataclasses.replace(self.like, hidden=None, residuals=None, draws=None)
         return dataclasses.replace(like, model=dataclasses.replace(like.model, laws=laws))
 
+    def night_at(self, mjd: float) -> int | None:
+        """The number among the nights of the one that a moment (MJD, UTC) belongs to; None where it is none of them."""
+        ends = np.array([(night.begin, night.end) for night in self.data.nights])
+        longitude = np.nan if self.like is None else self.like.site.longitude
+        *of_nights, evening = night_of(np.append(ends, mjd), longitude)
+        same = np.flatnonzero(np.array(of_nights[::2]) == evening)
+        return int(self.data.equations.night[same[0]]) if len(same) else None
+
     def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
-        nights, scale = self.data.nights, self.data.equations.scale
-        if self.like is not None and np.isfinite(self.like.site.longitude):
-            number = int(night_of(np.array([mjd], float), self.like.site.longitude)[0])
-        else:
-            number = next((n.number for n in nights if n.begin <= mjd <= n.end), -1)
-        evenings = sorted({n.number for n in nights})
-        value, covariance = self.solution.predict(mjd, evenings.index(number) if number in evenings else None)
-        value, covariance = self.data.origin + value * scale, covariance * np.outer(scale, scale)
+        data, solution, scale = self.data, self.solution, self.data.equations.scale
+        moved, scatter = np.zeros(len(solution.shared)), np.zeros(len(scale))
         for case in self.breaks:
             if case.kind == "step" and case.before < mjd < case.after:
-                i = self.data.names.index(case.name)
                 share = (mjd - case.before) / (case.after - case.before)
-                value[i] += case.size * (share - (mjd >= case.date))
-                covariance[i, i] += (case.size**2 + case.error**2) * share * (1.0 - share)
-        return value, covariance
+                change = among_globals(data, solution, case)
+                moved += (share - (mjd >= case.date)) * change
+                variance = (case.size**2 + case.error**2) * share * (1.0 - share)
+                scatter[data.names.index(case.name)] += variance * change.any()
+        value, covariance = solution.predict(mjd, self.night_at(mjd), moved)
+        return data.origin + value * scale, covariance * np.outer(scale, scale) + np.diag(scatter)
 
     def at(self, mjd: float, *, force: bool = False) -> Calibration:
         """The calibration of a moment (MJD, UTC).
