@@ -1,6 +1,7 @@
 """Breaks in series of linear equations with a known truth: chances, dates, names, and nights that took no part."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.model.effects.change import Change
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights import breaks, stacking
+from walop_jax.nights import breaks, night_file, stacking
 from walop_jax.nights.algebra import Equations
 from walop_jax.nights.equations import EffectAmplitude, Night, Together, together
 from walop_jax.nights.survey import Survey
@@ -215,15 +216,20 @@ def test_between_the_nights_of_a_step_it_has_happened_or_not():
         np.testing.assert_allclose(covariance, mixture, rtol=1e-7, atol=1e-9 * np.abs(mixture).max())
 
 
-def test_a_break_that_is_no_law_changes_nothing():
-    """One that a survey of other laws had."""
-    data = series(0)
-    step = step_before_night_40(data)
-    solution = breaks.solved(data, LAWS)
-    survey, plain = (Survey(data, LAWS, solution, breaks=found) for found in ((step,), ()))
-    mjd = step.before + 0.4 * (step.after - step.before)
-    for one, other in zip(survey.values_at(mjd), plain.values_at(mjd), strict=True):
-        np.testing.assert_array_equal(one, other)
+def test_a_break_of_a_survey_whose_law_is_left_out_is_found_anew(tmp_path):
+    """Stacked again with laws of its nights that do not have it: once in the list, or not at all."""
+    change = np.zeros((NIGHTS, N))
+    change[40:, 5] = 1.2
+    nights, laws = series(7, change).nights, {f"p{k}.x": law for k, law in enumerate(LAWS) if law}
+    (step,) = stacking.stack(nights, laws).breaks
+    night_file.write_nights(tmp_path / "nights.fits", nights)
+    document = {"breaks": [dataclasses.asdict(step)], "events": []}
+    (tmp_path / "survey.json").write_text(json.dumps(document))
+    (again,) = stacking.stack([tmp_path], laws).breaks
+    assert (again.name, again.date) == (step.name, step.date)
+    assert stacking.stack([tmp_path], laws, find=False).breaks == ()
+    kept = stacking.stack([tmp_path], laws | {"p5.x": Law(("step",), at=(step.date,))}, find=False)
+    assert kept.breaks[0].size == pytest.approx(step.size)
 
 
 def nightly():

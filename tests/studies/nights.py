@@ -173,7 +173,7 @@ def null_scores(solution, count: int, rng: np.random.Generator) -> np.ndarray:
     noise = np.stack(
         [(roots()[u % len(few())] @ rng.normal(size=(n, count))) * e.scale[:, None] for u in range(len(e))]
     )
-    precision = np.sqrt([entry.precision for entry in system.globals])[:, None]
+    precision = np.sqrt(system.precision)[:, None]
     right = precision * rng.normal(size=(len(precision), count)) - np.einsum(
         "ug,ugm->gm", system.basis, noise[:, system.at]
     )

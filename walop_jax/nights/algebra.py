@@ -62,15 +62,6 @@ class Equations:
         return dataclasses.replace(self, **of_units)
 
 
-class Global(NamedTuple):
-    """An unknown of all nights: the parameter that it belongs to, its function of time, its prior (mean, precision)."""
-
-    parameter: int
-    form: Form
-    mean: float
-    precision: float
-
-
 class Cell(NamedTuple):
     """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions."""
 
@@ -94,11 +85,17 @@ class Eliminated(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """The unknowns of equations under laws: what `solve` eliminates."""
+    """The unknowns of equations under laws: what `solve` eliminates.
+
+    Of unknowns of all nights `at` are the parameters, `forms` the functions of time, `mean` and `precision` the priors.
+    """
 
     equations: Equations
     laws: tuple[Law | None, ...]
-    globals: tuple[Global, ...]
+    at: Int[np.ndarray, " g"]
+    forms: tuple[Form, ...]
+    mean: Float[np.ndarray, " g"]
+    precision: Float[np.ndarray, " g"]
     cells: tuple[Cell, ...]
     rates: Float[np.ndarray, " n"]  # per √day, NaN where there is no walk
     spread: Float[np.ndarray, " n"]
@@ -108,20 +105,15 @@ class System:
         cls, equations: Equations, laws: Laws, mean: Vector, width: Vector, means: Bool[np.ndarray, " n"]
     ) -> System:
         """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
-        scale, forms = equations.scale, []
-        mean, width, middle = mean / scale, width / scale, float(equations.mjd.mean())
-        for i, law in enumerate(laws):
-            for form, has_prior in () if law is None else law.forms(bool(means[i]), middle):
-                forms.append(Global(i, form, *((mean[i], width[i] ** -2.0) if has_prior else (0.0, 0.0))))
+        scale, middle = equations.scale, float(equations.mjd.mean())
+        mean, precision = mean / scale, (width / scale) ** -2.0
+        every = [(i, *f) for i, law in enumerate(laws) if law for f in law.forms(bool(means[i]), middle)]
+        at, stated = np.array([i for i, *_ in every], int), np.array([has for *_, has in every], bool)
+        centre, strength = np.where(stated, [mean[at], precision[at]], 0.0)
         rates = np.array([law and law.rate for law in laws], float) / scale  # None is NaN
         spread = np.array([law and law.spread for law in laws], float) / scale
-        cells = _cells(equations, laws, mean, width, spread)
-        return cls(equations, tuple(laws), tuple(forms), cells, rates, spread)
-
-    @functools.cached_property
-    def at(self) -> Int[np.ndarray, " g"]:
-        """The parameter of every global unknown."""
-        return np.array([entry.parameter for entry in self.globals], int)
+        forms, cells = (form for _, form, _ in every), _cells(equations, laws, mean, precision, spread)
+        return cls(equations, tuple(laws), at, tuple(forms), centre, strength, tuple(cells), rates, spread)
 
     @functools.cached_property
     def basis(self) -> Float[np.ndarray, "u g"]:
@@ -131,8 +123,7 @@ class System:
     def functions(self, mjd: Any) -> Float[np.ndarray, "t g"]:
         """The functions of time of the global unknowns."""
         times = np.atleast_1d(mjd)
-        courses = (entry.form.at(times) for entry in self.globals)
-        return np.column_stack([np.zeros((len(times), 0)), *courses])
+        return np.column_stack([np.zeros((len(times), 0)), *(form.at(times) for form in self.forms)])
 
     @functools.cached_property
     def locals(self) -> list[tuple[int, int, int, Int[np.ndarray, " v"]]]:
@@ -159,7 +150,7 @@ class System:
                 yield 1.0 / (self.rates[i] ** 2 * (stop - start)), before, after
 
 
-def _cells(equations: Equations, laws: Laws, mean: Vector, width: Vector, spread: Vector) -> tuple[Cell, ...]:
+def _cells(equations: Equations, laws: Laws, mean: Vector, precision: Vector, spread: Vector) -> list[Cell]:
     """The cells in the order of time; the first state of a walk alone has the prior of its parameter."""
     local = {i: law for i, law in enumerate(laws) if law is not None and law.base in LOCAL}
     ends = np.ones(equations.night.max() + 1, bool)  # of a cell, with each night
@@ -169,7 +160,7 @@ def _cells(equations: Equations, laws: Laws, mean: Vector, width: Vector, spread
             ends[nights.min() : nights.max()] = False
     label = np.append(0, np.cumsum(ends))[equations.night]
     scatters = np.isfinite(spread)
-    mean, precision = np.where(scatters, 0.0, mean), np.where(scatters, spread, width) ** -2.0
+    mean, precision = np.where(scatters, 0.0, mean), np.where(scatters, spread**-2.0, precision)
     cells: list[Cell] = []
     for number in np.unique(label):
         units = np.flatnonzero(label == number)
@@ -182,7 +173,7 @@ def _cells(equations: Equations, laws: Laws, mean: Vector, width: Vector, spread
                 priors.append((0.0, 0.0) if law.base == "walk" and (cells or k) else (mean[i], precision[i]))
         acts = np.array(covers, float).reshape(-1, len(units))
         cells.append(Cell(units, np.array(parameter, int), acts, *np.array(priors, float).reshape(-1, 2).T))
-    return tuple(cells)
+    return cells
 
 
 class UndeterminedError(ValueError):
@@ -226,10 +217,8 @@ def solve(system: System) -> Solution:
                 summed = np.tensordot(weight, e.matrix, 1)[np.ix_(at[mine], at[columns])]
                 top[np.ix_(mine, columns)] = summed
                 top[np.ix_(columns, mine)] = summed.T
-    precision = np.array([entry.precision for entry in system.globals])
-    means = np.array([entry.mean for entry in system.globals])
-    top[np.diag_indices(size)] += precision
-    right += precision * means
+    top[np.diag_indices(size)] += system.precision
+    right += system.precision * system.mean
     blocks = [_block(system, cell) for cell in system.cells]
     sizes = [len(cell.parameter) for cell in system.cells]
     links = [np.zeros(shape) for shape in zip(sizes, [0, *sizes[:-1]], strict=True)]  # with the cell before

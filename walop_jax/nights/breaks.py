@@ -126,9 +126,9 @@ class Tried(NamedTuple):
         mjd, n = solution.system.equations.mjd, len(solution.system.laws)
         course = np.repeat(((mjd - mjd.mean()) / YEAR)[:, None], n, axis=1)
         drift, of_drift = changes.weighted(solution, course, np.arange(n))
-        scores, known = changes.scan(solution)
-        always, known[0, 0] = known[0, 0].copy(), 0.0
-        information = *known, np.diag(of_drift)[None].copy()
+        scores, by_cell = changes.scan(solution)
+        always, by_cell[0, 0] = by_cell[0, 0].copy(), 0.0
+        information = *by_cell, np.diag(of_drift)[None].copy()
         for of_kind in information:
             of_kind[:, list(barred)] = 0.0
         return cls((*scores, drift[None]), information, always)
@@ -199,22 +199,19 @@ def find(
 
 
 def among_globals(data: Together, solution: Solution, one: Break) -> Float[np.ndarray, " g"]:
-    """The size of a break as a sum of global unknowns, by their weights: zeros where no law has it."""
+    """The size of a break, which is a law, as a sum of global unknowns: their weights."""
     system, i = solution.system, data.names.index(one.name)
     form, law = one.form(float(data.equations.mjd.mean())), system.laws[i]
-    forms = [entry.form if entry.parameter == i else None for entry in system.globals]
-    change = np.array([float(f is not None and (f.kind, f.start) == (form.kind, form.start)) for f in forms])
+    change = np.array([float((f.kind, f.start) == (form.kind, form.start)) for f in system.forms])
     # Intervals have values before and after, and no change.
-    if change.any() and one.kind == "step" and law is not None and law.base == "interval":
-        change -= [f is not None and f.stop == form.start for f in forms]
-    return change
+    if one.kind == "step" and law is not None and law.base == "interval":
+        change -= [f.stop == form.start for f in system.forms]
+    return np.where(system.at == i, change, 0.0)
 
 
 def at_solution(data: Together, solution: Solution, one: Break) -> Break:
     """A break with the size that a solution under its law gives it."""
     change, scale = among_globals(data, solution, one), data.equations.scale[data.names.index(one.name)]
-    if not change.any():
-        return one
     size, error = change @ solution.shared, math.sqrt(change @ solution.covariance @ change)
     return dataclasses.replace(one, size=float(scale * size), error=float(scale * error))
 

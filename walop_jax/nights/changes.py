@@ -20,14 +20,14 @@ NOTHING = 1e-9  # share of its information below which a change is taken up by t
 
 
 def _information(
-    of: Solution, own: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
+    of: Solution, direct: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
 ) -> Float[np.ndarray, " n"]:
-    """Own information less what locals and globals take."""
-    remaining = own - taken
+    """Direct information less what locals and globals take."""
+    remaining = direct - taken
     if len(cross):
         lower = linalg.solve_triangular(of.factor[0], cross, lower=True, check_finite=False)
         remaining = remaining - np.einsum("gn,gn->n", lower, lower)
-    return np.where(remaining > NOTHING * np.maximum(own, 1e-300), remaining, 0.0)
+    return np.where(remaining > NOTHING * np.maximum(direct, 1e-300), remaining, 0.0)
 
 
 def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2 c n"]]:
@@ -39,7 +39,7 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
     system, e = of.system, of.system.equations
     n, count, globals_ = len(system.laws), len(system.cells), len(system.at)
     score, information = np.zeros((2, count, n)), np.zeros((2, count, n))
-    cross, own = np.zeros((globals_, n)), np.zeros(n)
+    cross, direct = np.zeros((globals_, n)), np.zeros(n)
     absorbed, border_taken = np.zeros(n), np.zeros((globals_, n))
     behind: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
     for c in reversed(range(count)):
@@ -51,7 +51,7 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
             cross_here += system.basis[unit][:, None] * matrix[system.at]
             local += cell.covers[:, v : v + 1] * matrix[cell.parameter]
             mine += np.diag(matrix)
-        cross, own = cross + cross_here, own + mine
+        cross, direct = cross + cross_here, direct + mine
         score[:, c] = -of.slopes[cell.units].sum(axis=0)
         block, border, moved = entry.block, entry.border, local
         if behind is not None:
@@ -66,7 +66,7 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
         solved = cholesky_solve(joint, moved)
         taken = absorbed + np.einsum("kn,kn->n", moved, solved)
         beyond = cross - border_taken - sides.T @ solved
-        information[0, c] = _information(of, own, beyond, taken)
+        information[0, c] = _information(of, direct, beyond, taken)
         solved = cholesky_solve(joint, local)
         taken = np.einsum("kn,kn->n", local, solved)
         information[1, c] = _information(of, mine, cross_here - sides.T @ solved, taken)

@@ -31,7 +31,7 @@ from walop_jax.fit.model_file import header_of
 from walop_jax.fit.search import nearer
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.columns import Columns
+from walop_jax.likelihood.columns import Change, Columns
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -134,8 +134,6 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 
 # ------------------------------------------------------------------------------------------------------ candidates
 
-Change = tuple[tuple[float, Any], ...]
-
 
 @dataclasses.dataclass(frozen=True)
 class EffectAmplitude(Parameter):
@@ -152,9 +150,8 @@ class EffectAmplitude(Parameter):
     def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
         """That of a leaf of a probe; `group` is None where the effect has a single one."""
         of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
-        return cls.read(
-            dataclasses.replace(leaf, name=f"{effect}{of_group}.{leaf.name}{of_member}", start=0.0)
-        )
+        name = f"{effect}{of_group}.{leaf.name}{of_member}"
+        return cls.read(dataclasses.replace(leaf, name=name, start=0.0))
 
     @classmethod
     def read(cls, parameter: Parameter) -> EffectAmplitude:
@@ -173,7 +170,8 @@ def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
 ) -> Candidates:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
-    context, candidates = effect_context(model.template, exposures), {}
+    context = effect_context(model.template, exposures)
+    candidates: Candidates = {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
@@ -189,8 +187,8 @@ def candidates_of(
                 for leaf, change in zip(of, first_order, strict=True):
                     amplitude = EffectAmplitude.of(leaf, kind.name, g if len(groups) > 1 else None, m)
                     candidates[amplitude.name] = amplitude, change
-    held = [model[name] for name in gauges(model, flux_known=False) if not model[name].free]
-    return candidates | {p.name: (p, ()) for p in held}
+    held = (name for name in gauges(model, flux_known=False) if not model[name].free)
+    return candidates | {name: (model[name], ()) for name in held}
 
 
 def with_candidates(
@@ -449,7 +447,6 @@ def together(nights: Sequence[Night]) -> Together:
 _NO_SITE = (
     "give all files the longitude of the site (SITELONG), which says where a night ends, and correct MJD"
 )
-_ONE_STAR = "correct one of them, or give it another NAME"
 
 
 def check_together(nights: Sequence[Night]) -> None:
@@ -468,7 +465,8 @@ def check_together(nights: Sequence[Night]) -> None:
             if p.name.startswith("standard.") and p.prior != mine.prior:
                 star = p.name.split(".")[1]
                 what = f"the catalogue has other values of {star} in {night.source} than in {theirs.source}"
-                raise fail(what, extension="SOURCES", advice=_ONE_STAR)
+                advice = "correct one of them, or give it another NAME"
+                raise fail(what, extension="SOURCES", advice=advice)
     by_number = sorted(nights, key=lambda night: (night.number, night.end))
     for before, after in itertools.pairwise(by_number):
         if after.begin < before.end and after.number != before.number:

@@ -36,7 +36,7 @@ from walop_jax.model.laws import Law, laws_of, resolved
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Laws, OfUnits, Solution, UndeterminedError
-from walop_jax.nights.breaks import Break, at_solution, solved
+from walop_jax.nights.breaks import Break, at_solution, solved, with_breaks
 from walop_jax.nights.breaks import find as breaks_of
 from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
 from walop_jax.nights.making import Data, Maker, Task, made
@@ -117,7 +117,8 @@ def stack(
         tables = maker.like.model.laws
     chosen = laws_of_all(data, tables)
     _check_filters(data, chosen)
-    breaks = [entry for source in opened for entry in source.breaks]
+    every = (entry for source in opened for entry in source.breaks)
+    breaks = [entry for entry in every if with_breaks(data, chosen, [entry]) == chosen]  # still laws
     try:
         if find and len({night.number for night in data.nights}) > 2:
             # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.

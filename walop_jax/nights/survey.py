@@ -79,16 +79,16 @@ class Survey(Drawn):
         determines counts as none, as in a fit (`likelihood.inverses.determined`).
         """
         solution, system = self.solution, self.solution.system
-        cells, has_prior = system.cells, np.array([p.prior is not None for p in self.data.parameters])
-        parameter = np.concatenate([system.at, *(cell.parameter for cell in cells)])
-        precision = [[entry.precision for entry in system.globals], *(cell.precision for cell in cells)]
-        mean = [[entry.mean for entry in system.globals], *(cell.mean for cell in cells)]
-        away = np.concatenate([solution.shared, *solution.local]) - np.concatenate(mean)
-        variance = [np.diag(solution.covariance), *(np.diag(block) for block, *_ in solution.smoothed)]
+        unknowns = [(group.mean, group.precision) for group in (system, *system.cells)]
+        mean, precision = map(np.concatenate, zip(*unknowns, strict=True))
+        parameter = np.concatenate([system.at, *(cell.parameter for cell in system.cells)])
+        away = np.concatenate([solution.shared, *solution.local]) - mean
+        variance = [np.diag(solution.covariance), *(np.diag(block) for block, _ in solution.smoothed)]
+        has_prior = np.array([p.prior is not None for p in self.data.parameters])
         local = np.arange(len(parameter)) >= len(system.at)
         stated = has_prior[parameter] | (local & np.isfinite(system.spread[parameter]))
-        priors = np.where(stated, np.concatenate(precision), 0.0)
-        loose = np.concatenate(precision) - priors
+        priors = np.where(stated, precision, 0.0)
+        loose = precision - priors
         chi2 = solution.chi2 + priors @ away**2 + sum(solution.walked)
         # A step of a walk is expected to be about 0: a constraint as well.
         constraints = np.count_nonzero(priors) + len(solution.walked)
@@ -218,10 +218,8 @@ class Survey(Drawn):
         for case in self.breaks:
             if case.kind == "step" and case.before < mjd < case.after:
                 share = (mjd - case.before) / (case.after - case.before)
-                change = among_globals(data, solution, case)
-                moved += (share - (mjd >= case.date)) * change
-                variance = (case.size**2 + case.error**2) * share * (1.0 - share)
-                scatter[data.names.index(case.name)] += variance * change.any()
+                moved += (share - (mjd >= case.date)) * among_globals(data, solution, case)
+                scatter[data.names.index(case.name)] += (case.size**2 + case.error**2) * share * (1.0 - share)
         value, covariance = solution.predict(mjd, self.night_at(mjd), moved)
         return data.origin + value * scale, covariance * np.outer(scale, scale) + np.diag(scatter)
 
