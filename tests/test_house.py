@@ -206,7 +206,7 @@ MOST_LINES = {
     "posterior": 2182,
     "science": 5907,
     "diagnosis": 7943,
-    "nights": 2554,
+    "nights": 2550,
     "plans": 2219,
     "paper": 775,
     "reports": 2665,

@@ -37,6 +37,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np  # noqa: E402
 from scipy import linalg, optimize, stats  # noqa: E402
 
+from walop_jax.calibration.accuracy import p_forms, sample_stars  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.product import read_calibration  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
@@ -403,8 +404,9 @@ def stars(count: int, start: int = 0, nights: int = 243) -> None:
 
 def slopes_of(survey: Survey, names: Sequence[str]) -> np.ndarray:
     """Derivatives of p (points × stars) to the parameters of the nights, along which stars are wrong."""
-    slopes, known = survey._slopes, survey._full.model.names
-    assert slopes is not None
+    assert survey._matrix is not None
+    matrix, of_matrix, *_ = survey._matrix
+    slopes, known = p_forms(matrix, sample_stars()) @ of_matrix, survey._full.model.names
     found = np.zeros((slopes.shape[0] * slopes.shape[1], len(names)))
     for k, name in enumerate(names):
         if name in known:

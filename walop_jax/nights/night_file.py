@@ -61,14 +61,10 @@ def write_nights(path: str | os.PathLike[str], nights: Sequence[Night], *, overw
     if any(night.names != first.names or night.model != first.model for night in nights):
         raise ValueError("nights of different parameters go into files of their own")
     p, lower = first.parameters, np.tril_indices(len(first.names))
-    parameters = {
-        "NAME": first.names,
-        "UNIT": [entry.unit for entry in p],
-        "START": [entry.start for entry in p],
+    stated = ("NAME", "UNIT", "START", "LOOSE", "SCALE")
+    parameters = {column: [getattr(entry, column.lower()) for entry in p] for column in stated} | {
         "PRIOR_MEAN": [entry.prior and entry.prior[0] for entry in p],
         "PRIOR_WIDTH": [entry.width for entry in p],
-        "LOOSE": [entry.loose for entry in p],
-        "SCALE": [entry.scale for entry in p],
         "CANDIDATE": np.arange(len(p)) >= len(p) - first.candidates,
     }
     stored = [
