@@ -106,7 +106,7 @@ class System:
     ) -> System:
         """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
         scale, middle = equations.scale, float(equations.mjd.mean())
-        mean, precision = mean / scale, (width / scale) ** -2.0
+        mean, precision = mean / scale, np.array([w**-2.0 for w in width / scale])
         every = [(i, *f) for i, law in enumerate(laws) if law for f in law.forms(bool(means[i]), middle)]
         at, stated = np.array([i for i, *_ in every], int), np.array([has for *_, has in every], bool)
         centre, strength = np.where(stated, [mean[at], precision[at]], 0.0)
