@@ -25,7 +25,7 @@ from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
-from walop_jax.commands.program import NEXT, UNTRUSTED
+from walop_jax.commands.program import UNTRUSTED
 from walop_jax.likelihood import limits
 from walop_jax.simulation.simulate import simulate
 
@@ -193,13 +193,6 @@ def test_so_is_what_takes_minutes(line: Line, call, here: Path):
     if "frames.fits" in line.words:
         _frames(here / "frames.fits")
     _type(line, call)
-
-
-def test_suggestions_have_no_words_but_commands():
-    """What is printed after `Next:` can be typed, but for the one thing that no program does."""
-    told = [line for several in NEXT.values() for line in several]
-    assert [line for line in told if not line.startswith("walop-jax ")] == ["open the page in a browser"]
-    assert not [line for line in told if "," in line or len(line.split()) < 3]
 
 
 def _type(line: Line, call: Call) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import walop_jax as walop
 from walop_jax.calibration.product import read_product
-from walop_jax.commands import compare, diagnose
+from walop_jax.commands import diagnose
 from walop_jax.io.errors import DataError
 from walop_jax.reports.run import read_run
 
@@ -17,8 +17,8 @@ from .conftest import FittedSet
 
 OUTPUTS = {
     "refit": ("calibration.fits", "summary.json"),
-    "diagnose": diagnose.OUTPUTS,
-    "compare": compare.OUTPUTS,
+    "diagnose": walop.diagnose.command.writes,
+    "compare": walop.compare.command.writes,
     "limits": ("limits.json", "limits_separation.png"),
 }
 

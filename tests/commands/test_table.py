@@ -16,7 +16,7 @@ from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
-from walop_jax.commands.command import COMMON, Argument
+from walop_jax.commands.command import COMMON
 from walop_jax.data.settings import DEFAULT_FILTER
 from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
 from walop_jax.fit import outliers
@@ -45,7 +45,7 @@ def test_options_are_those_of_the_function(name: str, call):
     assert own == list(command.options)
     text = call(name, "--help").output
     for key, option in command.options.items():
-        spelled = option.metavar if isinstance(option, Argument) else f"--{key.replace('_', '-')}"
+        spelled = option.metavar if option.placed else f"--{key.replace('_', '-')}"
         assert spelled in text, key
         assert " ".join(option.help.split()[:3]) in " ".join(text.split())
         assert f"\n{key}: {option.help}" in function.__doc__

@@ -62,14 +62,13 @@ def main() -> None:
         raise SystemExit(INTERRUPTED) from None
 
 
-def is_interrupt(error: BaseException) -> bool:
+def is_interrupt(error: BaseException | None) -> bool:
     """True if an error goes back to an interrupt that was caught on the way."""
-    before: BaseException | None = error
-    for _ in range(20):
-        if before is None or isinstance(before, KeyboardInterrupt):
+    for _ in range(20):  # a chain of errors may be a ring
+        if error is None or isinstance(error, KeyboardInterrupt):
             break
-        before = before.__cause__ or before.__context__
-    return isinstance(before, KeyboardInterrupt)
+        error = error.__cause__ or error.__context__
+    return isinstance(error, KeyboardInterrupt)
 
 
 def _open_streams() -> None:

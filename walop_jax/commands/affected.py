@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.apply import calibration_for
+from walop_jax.commands.apply import calibration_for, stars_of
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, Product
 from walop_jax.commands.tables import named_tables
+from walop_jax.io.errors import errors_naming
 from walop_jax.io.names import AFFECTED
 
 if TYPE_CHECKING:
@@ -38,10 +39,8 @@ def affected(
 
     >>> walop.affected("OLD", "NEW", ["night1.fits", "night2.fits"]).again  # doctest: +SKIP
     """
-    from walop_jax.io.errors import errors_naming
     from walop_jax.science.affected import Affected
     from walop_jax.science.affected import affected as nights_of
-    from walop_jax.science.catalogue import read_catalogue
 
     if not limit > 0:
         raise UsageError(f"{limit} must be above 0 standard errors", "limit")
@@ -54,9 +53,7 @@ def affected(
             raise UsageError(f"{what}: give two of one instrument", "new")
         replaced.append(before.content_hash())
         replacing.append(after.content_hash())
-        rows = read_catalogue(
-            table, before.model.template.patched(), always_in=before.always_in, never_in=before.never_in
-        )
+        rows = stars_of(table, before)
         warnings += [f"{name}: {remark}" for remark in rows.remarks if remark.startswith("INSTRUME")]
         made_with = str(table.table.meta.get("CALHASH", ""))
         if made_with == replacing[-1] != replaced[-1]:
@@ -65,9 +62,9 @@ def affected(
             warnings.append(f"{name}: was made with a calibration that is neither the old nor the new one")
         job.tell(f"{len(rows)} rows of {name}", "tabulating")
         with errors_naming(table.path):
-            shifts_of_catalogue = list(nights_of(before, after, rows, name, limit))
-        nights += shifts_of_catalogue
-        if beyond := sum(night.beyond for night in shifts_of_catalogue):
+            shifted = list(nights_of(before, after, rows, name, limit))
+        nights += shifted
+        if beyond := sum(night.beyond for night in shifted):
             what = "stars have a filter or temperature that the new one does not cover"
             warnings.append(f"{name}: {beyond} {what}")
     first, second = (", ".join(dict.fromkeys(hashes)) for hashes in (replaced, replacing))

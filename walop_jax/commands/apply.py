@@ -5,21 +5,23 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of, several
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of, several, typed
 from walop_jax.commands.gather import gather
 from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
-from walop_jax.io.errors import DataError, errors_naming
+from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from walop_jax import Calibration
     from walop_jax.data.user_tables import InputTable
+    from walop_jax.science.catalogue import Catalogue
 
 
 @command(stages=("reading", "tabulating", "writing"), writes=())
@@ -77,12 +79,12 @@ def apply(
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
-    from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
 
     if (workers is not None or scheduler is not None) and not each:
-        raise UsageError("a single table is made by one process; see --each", "workers")
+        wrong = "scheduler" if workers is None else "workers"
+        raise UsageError("a single table is made by one process; see --each", wrong)
     if workers is not None and scheduler is not None:
         raise UsageError("workers and scheduler exclude each other", "scheduler")
     if debias not in ESTIMATORS:
@@ -102,8 +104,7 @@ def apply(
     held = None if is_survey(calibration) else calibration_of(calibration, effects)
     table, gathering_remarks = _table_of(catalogue, held)
     held = held or calibration_for(calibration, table, effects, force=force)
-    instrument, limit = held.model.template.patched(), math.inf if saturation is None else saturation
-    rows = read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
+    rows = stars_of(table, held, math.inf if saturation is None else saturation)
     job.tell("tabulating the analysis vectors", "tabulating")
     used = held if posterior is None else with_moments(held, posterior)
     with errors_naming(table.path):
@@ -111,7 +112,7 @@ def apply(
         seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
     columns = added.stokes_columns(stars, rows.star, debias)
-    warnings = [*gathering_remarks, *added.sentences(rows, stars, instrument.cameras.names)]
+    warnings = [*gathering_remarks, *added.sentences(rows, stars, held.design.cameras.names)]
     warnings += [] if seen_twice is None else seen_twice.warnings()
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     outcome = table_outcome(
@@ -134,16 +135,26 @@ def apply(
     )
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
-    stars_of = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
-    text = f"{output}: {stars_of}{added.errors_in_words(columns)}{zones}"
-    return dataclasses.replace(outcome, text=text, next=(f"topcat {output}",) if common else ())
+    size = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
+    text = f"{output}: {size}{added.errors_in_words(columns)}{zones}"
+    step = (
+        shlex.join(("topcat", str(output))) if common else typed("watch", calibration, output, "-o", "WATCH")
+    )
+    return dataclasses.replace(outcome, text=text, next=(step,))
+
+
+def stars_of(table: InputTable, held: Calibration, limit: float = math.inf) -> Catalogue:
+    """The stars of a table, as a calibration can correct them; counts from `limit` on are not used."""
+    from walop_jax.science.catalogue import read_catalogue
+
+    instrument = held.model.template.patched()
+    return read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
 
 
 def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Sequence[str]]:
     """The table of a catalogue, of those of the cameras as one, with remarks on how they were made one."""
-    given = catalogue if isinstance(catalogue, list | tuple) else [catalogue]
-    if len(given) == 1:
-        return table_of(given[0], {}), ()
+    if len(tables := several(catalogue)) == 1:
+        return table_of(tables[0], {}), ()
     from walop_jax.data.user_tables import in_memory
 
     instrument = None if held is None else held.design
@@ -217,14 +228,14 @@ def _apply_to_each(
 
 def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:
     """The outcome of one `apply` (overwrite or not, arguments), in any process; without the table."""
-    import walop_jax
     from walop_jax.model.compiled import float64
 
     overwrite, arguments = call
     try:
         with float64():
-            outcome = command_of(walop_jax.apply).run(Job(overwrite=overwrite), dict(arguments))
-    except (DataError, UsageError) as error:
+            outcome = command_of(apply).run(Job(overwrite=overwrite), arguments)
+    except (ValueError, OSError) as error:
         return Outcome(None, {}, "", failure=str(error))
-    text, content = outcome.printed(), outcome.content
-    return Outcome(None, content, text, warnings=outcome.warnings, failure=outcome.failure)
+    return Outcome(
+        None, outcome.content, outcome.printed(), warnings=outcome.warnings, failure=outcome.failure
+    )

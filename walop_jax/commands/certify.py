@@ -6,10 +6,10 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
 from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
-from walop_jax.io.names import COMMISSIONING
+from walop_jax.io.names import COMMISSIONING, PRODUCT
 
 if TYPE_CHECKING:
     from walop_jax.science.commissioning import Certificate
@@ -61,10 +61,15 @@ def certify(
         else:
             held = held if in_memory else read_calibration(path, catalogue)
             with contextlib.suppress(DataError):  # its exposures are looked at where they can be found
-                calset = None if in_memory else Run(path.parent).calset
+                calset = Run(path.parent).calset if path.name == PRODUCT else None
             needs = requirements(held.verdict, "", field_accuracy(held), calset)
     parents = tuple(entry.sha256 for entry in product.inputs)
     certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
     failed = ", ".join(check.name for check in certificate.failed)
-    failure = failed and f"{path}: not valid: {failed}"
-    return Outcome(certificate, saved_as=COMMISSIONING, failure=failure, trusted=certificate.go)
+    return Outcome(
+        certificate,
+        saved_as=COMMISSIONING,
+        failure=failed and f"{path}: not valid: {failed}",
+        trusted=certificate.go,
+        next=(typed("apply", calibration, "STARS.fits", "-o", "OUT.fits"),) if certificate.go else (),
+    )

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, command
-from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of
-from walop_jax.io.errors import errors_naming
+from walop_jax.commands.products import Effects, Product, calibration_of
+from walop_jax.io.names import POSTERIOR
 
 if TYPE_CHECKING:
     from walop_jax.model.references import Reference
@@ -16,33 +16,28 @@ if TYPE_CHECKING:
 
 @command()
 def cite(
-    job: Job, run: OptionalProduct = None, *, bibtex: bool = False, effects: Effects = None
+    job: Job, run: Product | None = None, *, bibtex: bool = False, effects: Effects = None
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included.
 
     >>> walop.cite(result)[1].what
     'polariser'
     """
-    from walop_jax import Run, __version__
-    from walop_jax.calibration.product import product_path
+    from walop_jax import __version__
     from walop_jax.data.settings import DEFAULT_FILTER
     from walop_jax.fit import minimise
     from walop_jax.fit.model_file import model_without_data
-    from walop_jax.io.names import POSTERIOR
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.model.references import Reference, References, references
     from walop_jax.model.references import bibtex as entries
 
-    sampled = isinstance(run, Run) and POSTERIOR in run
-    if isinstance(run, str | os.PathLike) and Path(run).is_dir():
-        sampled = (Path(run) / POSTERIOR).exists()
+    folder = getattr(run, "folder", run)
+    sampled = isinstance(folder, str | os.PathLike) and (Path(folder) / POSTERIOR).exists()
     if run is None:
         model, filters = model_without_data(nominal_instrument()), [DEFAULT_FILTER]
     else:
-        path = product_path(run) if isinstance(run, str | os.PathLike) else None
-        with errors_naming(path):
-            calibration = calibration_of(run if path is None else path, catalogue_of(effects))
-            model, filters = calibration.model, calibration.exposures.filter.tolist()
+        calibration = calibration_of(run, effects)
+        model, filters = calibration.model, calibration.exposures.filter.tolist()
     sources = References((*references(model, filters), Reference("fit", minimise.SOURCE)))
     listed = [{"what": entry.what, "source": entry.source} for entry in sources]
     text = entries(sources, __version__, sampled=sampled) if bibtex else repr(sources)

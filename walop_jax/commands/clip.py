@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model
 from walop_jax.commands.products import IN_MEMORY, Effects
 from walop_jax.io.errors import fail
@@ -66,10 +66,14 @@ def clip(
         text = f"{share} of the rows are outliers: too many to be isolated; the model lacks something"
         warnings.insert(0, f"{text}; walop-jax diagnose looks for it")
     ratio = result.chi2 / max(result.dof, 1)
+    trusted = result.trusted and not flagged.too_many
+    options = given(model=model, instrument=instrument, effects=effects, elements=job.elements)
+    use, ask = ("refit", output), ("diagnose", *several(data))
     return Outcome(
         dataclasses.replace(flagged, result=result),
         {"output": str(output), "sigma": sigma, "clipped": flagged.rows, "used": flagged.used},
         f"{flagged.rows} of {flagged.used} rows flagged ({share}), χ²/dof {ratio:.4f}: {output}",
         warnings=warnings,
-        trusted=result.trusted and not flagged.too_many,
+        trusted=trusted,
+        next=(typed(*(use if trusted else ask), *options, "-o", "RUN"),),
     )

@@ -7,8 +7,6 @@ and the command of the program, whose options are the parameters with a row in `
 
 from __future__ import annotations
 
-import builtins
-import contextlib
 import csv
 import dataclasses
 import functools
@@ -16,18 +14,23 @@ import inspect
 import io
 import json
 import logging
+import os
+import re
+import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from walop_jax.io.errors import PathLike
+from walop_jax.io.atomic import atomic_path, check_output
+from walop_jax.io.errors import PathLike, fail, nearest
+from walop_jax.io.folder import NotWrittenError, OutputFolder, output_folder
 from walop_jax.io.progress import Stage
+from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
     from walop_jax.io.display import Display
-    from walop_jax.io.folder import OutputFolder
 
 LOG = logging.getLogger("walop_jax")
 """Of calls in Python: progress (INFO), and the warnings of a result; silent unless the caller sets it up."""
@@ -35,8 +38,8 @@ LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
-Writers = Mapping[str, Callable[[Path], object] | None]
-"""Writers of files by name; None: this result has no such file."""
+Writers = Mapping[str, str | Callable[[Path], object] | None]
+"""Texts, or writers, of files by name; None: this result has no such file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Option:
     """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
 
     `kind` is the type of the typed text (default: that of the annotation). `required` holds on the command line only,
-    where results that are not written would be lost.
+    where results that are not written would be lost. With `placed` it is an argument, known by its position.
     """
 
     help: str
@@ -53,10 +56,11 @@ class Option:
     short: str = ""
     required: bool = False
     least: float | None = None
+    placed: bool = False
 
-
-class Argument(Option):
-    """A parameter as an argument of the program, by its position."""
+    def spelled(self, name: str) -> str:
+        """The word for it on the command line, where the parameter is called `name`."""
+        return (self.metavar or name.upper()).strip("[]") if self.placed else f"--{name.replace('_', '-')}"
 
 
 KINDS: Mapping[str, Any] = {
@@ -70,9 +74,8 @@ def options_of_commands() -> Mapping[str, Mapping[str, Option]]:
     text = Path(__file__).with_name("options.csv").read_text(encoding="utf-8")
     options: dict[str, dict[str, Option]] = {"*": {}}
     for row in csv.DictReader(io.StringIO(text)):
-        form, least = Argument if row["FORM"] else Option, json.loads(row["LEAST"] or "null")
-        about = row["HELP"], row["METAVAR"] or None, KINDS[row["KIND"]], row["SHORT"]
-        option = form(*about, bool(row["NEED"]), least)
+        about = row["HELP"], row["METAVAR"] or None, KINDS[row["KIND"]], row["SHORT"], bool(row["NEED"])
+        option = Option(*about, json.loads(row["LEAST"] or "null"), bool(row["FORM"]))
         options.setdefault(row["COMMAND"], {})[row["NAME"]] = option
     return options
 
@@ -91,6 +94,7 @@ class Job:
 
     `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is called with each step. `folder`
     is the reserved folder of results (None: nothing is written). `typed`: on the command line, not from Python.
+    `elements` are the kinds of elements of one's own, which have been loaded.
     """
 
     overwrite: bool = False
@@ -98,6 +102,7 @@ class Job:
     progress: Tell = lambda text: None
     folder: OutputFolder | None = None
     typed: bool = False
+    elements: PathLike | Sequence[type] | None = None
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def tell(self, text: str, stage: str = "") -> None:
@@ -113,17 +118,6 @@ class Job:
         """The time since the command began."""
         return time.perf_counter() - self.began
 
-    @contextlib.contextmanager
-    def reserved(self, output: PathLike | None, names: Sequence[str]) -> Iterator[Job]:
-        """The job with the folder `output` reserved for the files `names` (None: nothing is written)."""
-        if output is None:
-            yield self
-            return
-        from walop_jax.io.folder import output_folder
-
-        with output_folder(output, names, overwrite=self.overwrite) as folder:
-            yield dataclasses.replace(self, folder=folder)
-
     def use_jax(self) -> None:
         """Switch JAX on, for commands that most often do without it."""
         if self.typed:
@@ -137,9 +131,39 @@ def several(given: Any) -> list[Any]:
     return list(given) if isinstance(given, list | tuple) else [given]
 
 
-def text_file(text: str) -> Callable[[Path], object]:
-    """Writer of a text file."""
-    return lambda path: path.write_text(text, encoding="utf-8")
+class Listing(dict[str, str]):
+    """Names with a line about each, printed so."""
+
+    def __repr__(self) -> str:
+        width = max(map(len, self), default=0)
+        return "\n".join(f"{name:<{width}}  {about}" for name, about in self.items())
+
+
+def write_text(path: PathLike, text: str, *, overwrite: bool) -> None:
+    """Write a single text file, whole or not at all."""
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def typed(*words: object) -> str:
+    """A command line to type, quoted as a shell needs it; the empty text where one of the words cannot be typed."""
+    can_be = all(isinstance(word, str | os.PathLike) for word in words)
+    return shlex.join(("walop-jax", *map(str, words))) if can_be else ""
+
+
+def given(**options: object) -> list[object]:
+    """The words by which options are given; those that are None are left out."""
+    return [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
+
+
+PICTURES = (".pdf", ".png", ".svg", ".eps", ".jpg")
+
+
+def check_picture(path: PathLike, *, overwrite: bool) -> None:
+    """Refuse the name of a picture that cannot be written, as `check_output` does, and for its extension."""
+    if Path(path).suffix.lower() not in PICTURES:
+        raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(PICTURES)}")
+    check_output(path, overwrite=overwrite)
 
 
 def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object]:
@@ -152,11 +176,12 @@ class Outcome(Generic[T]):
     """Result of a command: `value` for Python, and the output of the program.
 
     `document` is plain data (None: that of the value), to which `extra` is added; `display` is shown on a terminal
-    (None: that of the value), with the text `below` it; `text` is printed in its place. `files` write the files of the
-    output folder, each given its path; the document is written as the file `saved_as`, with the display.
-    `warnings` are sentences to bear in mind. `failure` is the error (exit code 1), `trusted` whether the
-    result can be used (exit code 3 if not). `next` are command lines that one might want to type next. `markdown`: the
-    text is laid out on a terminal.
+    (None: that of the value), with the text `below` it; `text` is printed in its place. `files` are texts of files of
+    the output folder, or write them, each given its path; the document is written as the file `saved_as`, with the
+    display; the files `drop` go then. `warnings` are sentences to bear in mind. `failure` is the error (exit code 1),
+    `trusted` whether the result can be used (exit code 3 if not). `next` are command lines that one might want to type
+    next (`typed`; empty ones are left out).
+    `markdown`: the text is laid out on a terminal.
     """
 
     value: T
@@ -168,6 +193,7 @@ class Outcome(Generic[T]):
     below: str = ""
     files: Writers = dataclasses.field(default_factory=dict)
     saved_as: str = ""
+    drop: Sequence[str] = ()
     warnings: Sequence[str] = ()
     failure: str = ""
     trusted: bool = True
@@ -193,50 +219,36 @@ class Outcome(Generic[T]):
             return self.text
         return "\n".join(filter(None, (self.shown.text(), self.below)))
 
-    def save(self, folder: OutputFolder, drop: Sequence[str] = ()) -> Outcome[T]:
+    def save(self, folder: OutputFolder) -> Outcome[T]:
         """Put all files into the output folder, together; gives the outcome, a failure where one was not written."""
-        from walop_jax.io.folder import NotWrittenError
-        from walop_jax.io.text import json_text
-
         absent = [name for name, write in self.files.items() if write is None]
         names = [name for name in folder.names if name not in absent]
         try:
-            with folder.filled(names, (*drop, *absent)) as temporary:
+            with folder.filled(names, (*self.drop, *absent)) as temporary:
                 for name, write in self.files.items():
-                    if write is not None:
+                    if callable(write):
                         write(temporary / name)
+                    elif write is not None:
+                        (temporary / name).write_text(write, encoding="utf-8")
                 if self.saved_as:
                     displayed = self.display is not None or hasattr(self.value, "display")
                     content = {**self.content, **({"shown": self.shown.document()} if displayed else {})}
-                    text_file(json_text(content))(temporary / self.saved_as)
+                    (temporary / self.saved_as).write_text(json_text(content), encoding="utf-8")
         except NotWrittenError as error:
             return dataclasses.replace(self, failure=self.failure or str(error))
         return self
 
 
-COMMON: Mapping[str, tuple[Any, Any]] = {
-    "overwrite": (False, bool), "progress": (None, Callable[[str], None] | None), "seed": (0, int),
+COMMON: Mapping[str, tuple[Any, str]] = {
+    "overwrite": (False, "bool"), "progress": (None, "Callable[[str], None] | None"), "seed": (0, "int"),
 }  # fmt: skip
 """The parameters that every command takes in Python, with their defaults and kinds."""
+
+NUMBERS = ("bool", "int", "int | None", "float", "float | None")  # annotations of parameters that are no text
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
 IN_THE_MODEL = "that is a matter of the model: model=base_model(calset).change('half1.wedge', free=False)"
 """Advice on arguments that users of other fitting programs expect."""
-
-
-class _Names(dict[str, Any]):
-    """The names of an annotation; imports of type checkers alone stand in as classes of that name."""
-
-    def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, None) or type(name, (), {"__module__": "walop_jax"})
-
-
-def _kind(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
-    """The kind of a parameter, with nothing heavy loaded."""
-    names = _Names({"Any": Any, "Mapping": Mapping, "PathLike": PathLike, "Sequence": Sequence})
-    names.update(vars(sys.modules[function.__module__]))
-    kind = eval(parameter.annotation, {}, names)
-    return eval(kind, {}, names) if isinstance(kind, str) else kind
 
 
 @dataclasses.dataclass
@@ -244,44 +256,44 @@ class Command(Generic[T]):
     """A command: `function` is the Python function, `run` the call of the program.
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
-    "file" if `output` is a single file; () if the body looks after its outputs itself. `random`: its seed matters.
+    "file" or "table" if `output` is a single one; () if the body looks after its outputs itself. `random`: its seed
+    matters.
     `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
-    `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
+    `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
+    share. `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
     """
 
     body: Callable[..., Outcome[T]]
     stages: Sequence[str] = ()
-    writes: Sequence[str] | Literal["file"] | None = None
+    writes: Sequence[str] | Literal["file", "table"] | None = None
     random: bool = False
     jax: bool = True
     elements: bool = False
 
     def __post_init__(self) -> None:
         self.name = self.body.__name__
-        options = options_of_commands()
-        self.described = {**options["*"], **options.get(self.name, {})}
-        parameters = list(inspect.signature(self.body).parameters.values())[1:]
-        self.own = [p.replace(annotation=_kind(self.body, p)) for p in parameters]
-        self.elements |= "effects" in (p.name for p in self.own)
-        names = [p.name for p in self.own] + ["elements"] * self.elements
-        self.options = {name: self.described[name] for name in names if name in self.described}
-
-    @functools.cached_property
-    def signature(self) -> inspect.Signature:
-        """The signature of the Python function: its own arguments, then those that all commands share."""
-        shared = {"elements": (None, PathLike | Sequence[type] | None), **COMMON}
+        module = vars(sys.modules[self.body.__module__])
+        aliases = {name: text for name, text in module.items() if isinstance(text, str)}
+        own = [
+            p.replace(annotation=re.sub(r"\w+", lambda word: aliases.get(word[0], word[0]), p.annotation))
+            for p in list(inspect.signature(self.body).parameters.values())[1:]
+        ]
+        self.elements |= "effects" in (p.name for p in own)
+        shared = {"elements": (None, "PathLike | Sequence[type] | None"), **COMMON}
         absent = {"elements": not self.elements, "overwrite": self.writes is None}
         make = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
-        added = (make(name, default=default, annotation=kind) for name, (default, kind) in shared.items())
-        return inspect.Signature([*self.own, *(p for p in added if not absent.get(p.name))])
+        added = [make(name, default=default, annotation=kind) for name, (default, kind) in shared.items()]
+        self.signature = inspect.Signature([*own, *(p for p in added if not absent.get(p.name))])
+        options = options_of_commands()
+        self.described = {**options["*"], **options.get(self.name, {})}
+        names = (name for name in self.signature.parameters if name not in COMMON)
+        self.options = {name: self.described[name] for name in names if name in self.described}
 
     def bound(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments of a call by name, with defaults. Raises TypeError, in a sentence, for others."""
         names = self.signature.parameters
         for key in kwargs:
             if key not in names:
-                from walop_jax.io.errors import nearest
-
                 advice = IN_THE_MODEL if key in OF_MODELS and "model" in names else nearest(key, names)
                 raise TypeError(f"{self.name}: there is no argument {key!r}; {advice}")
         try:
@@ -289,7 +301,7 @@ class Command(Generic[T]):
         except TypeError as error:
             raise TypeError(f"{self.name}: {error}; the arguments are {', '.join(names)}") from None
         for key, value in call.arguments.items():
-            if isinstance(value, str) and names[key].annotation in (bool, int, float, float | None):
+            if isinstance(value, str) and names[key].annotation in NUMBERS:
                 raise TypeError(f"{self.name}: {key} is the text {value!r}; give a number")
         call.apply_defaults()
         return dict(call.arguments)
@@ -327,21 +339,26 @@ class Command(Generic[T]):
         call.__doc__ = "\n\n".join((inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described)))
         return call
 
-    def run(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
+    def run(self, job: Job, arguments: Mapping[str, Any]) -> Outcome[T]:
         """Do the work, with results written as they are asked for."""
+        arguments = dict(arguments)
         if (elements := arguments.pop("elements", None)) is not None:
             from walop_jax.model.elements.registry import load_elements
 
             load_elements(elements)
-        output = arguments.get("output")
-        if self.writes == "file" and output is not None:
-            from walop_jax.io.atomic import check_output
-
+            job = dataclasses.replace(job, elements=elements)
+        output, names = arguments.get("output"), self.writes
+        if output is not None and isinstance(names, str):
             check_output(output, overwrite=job.overwrite)
-        names = () if self.writes is None or self.writes == "file" else self.writes
-        with job.reserved(output if names else None, names) as reserved:
-            outcome = self.body(reserved, **arguments)
-            return outcome if reserved.folder is None else outcome.save(reserved.folder)
+            if names == "table":
+                from walop_jax.io.plain_tables import table_format
+
+                table_format(output)
+        if output is None or not names or isinstance(names, str):
+            return self.body(job, **arguments)
+        with output_folder(output, names, overwrite=job.overwrite) as folder:
+            outcome = self.body(dataclasses.replace(job, folder=folder), **arguments)
+            return outcome.save(folder) if outcome.files or outcome.saved_as else outcome
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

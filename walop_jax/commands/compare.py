@@ -5,29 +5,31 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model, set_of
+from walop_jax.commands.products import Effects, Product
+from walop_jax.io.errors import fail
+from walop_jax.io.names import COMPARISON
 
 if TYPE_CHECKING:
     from walop_jax.paper.comparison import Comparison
 
-DOCUMENT, TABLE = "comparison.json", "comparison.fits"
-FIGURES = ("histogram", "map", "offset", "spectral")
-OUTPUTS = (DOCUMENT, TABLE, *(f"comparison_{name}.png" for name in FIGURES))
+TABLE = "comparison.fits"
+FIGURES = {f"comparison_{name}.png": f"{name}_figure" for name in ("histogram", "map", "offset", "spectral")}
 
 
-@command(stages=("reading", "fitting", "judging"), writes=OUTPUTS, random=True)
+@command(stages=("reading", "fitting", "judging"), writes=(COMPARISON, TABLE, *FIGURES), random=True)
 def compare(
     job: Job,
     data: Sets,
-    calibration: products.OptionalProduct = None,
+    calibration: Product | None = None,
     *,
     output: PathLike | None = None,
     truth: tuple[Any, Any, Any] | PathLike | None = None,
     filter: str = "SDSS-r",
     model: ModelLike = None,
     instrument: InstrumentLike = None,
-    effects: products.Effects = None,
+    effects: Effects = None,
 ) -> Outcome[Comparison]:
     """Compare the method of Paper II, as it is published, with the joint fit.
 
@@ -45,7 +47,6 @@ def compare(
     from walop_jax import Calibration
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
-    from walop_jax.io.errors import fail
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
     from walop_jax.reports import paper_figures
@@ -59,7 +60,7 @@ def compare(
     if held is None:
         calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     else:
-        calset, chosen = set_of(data), held.model
+        calset, chosen = set_of(data, held.design), held.model
     if [len(arm.analyser.cameras) for arm in chosen.template.arms] != [2, 2]:
         what = f"Paper II has a method for two arms of two cameras, which {chosen.name} is not"
         raise fail(f"{what}; refit and diagnose")
@@ -79,15 +80,15 @@ def compare(
     lost = joint.left_behind
     columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
     table = astropy_table(columns, products.left_out_cards(lost))
-    draw = {f"comparison_{name}.png": getattr(paper_figures, f"{name}_figure") for name in FIGURES}
-    pictures = {name: figure_file(figure, compared) for name, figure in draw.items()}
+    pictures = {file: figure_file(getattr(paper_figures, name), compared) for file, name in FIGURES.items()}
     doubts = () if trusted else (f"the joint fit: {text}" for text in warnings)
     return Outcome(
         compared,
         extra={"trusted": trusted, products.NOT_CARRIED_OVER: list(lost)},
         below="" if output is None else f"Written to {output}.",
         files={TABLE: lambda path: write_table(path, table), **pictures},
-        saved_as=DOCUMENT,
+        saved_as=COMPARISON,
         trusted=trusted,
         warnings=(*doubts, *products.left_out_sentences(lost)),
+        next=(typed("report", output),),
     )

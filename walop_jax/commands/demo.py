@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, command_of
+from walop_jax.commands.command import Job, Outcome, PathLike, command, command_of, typed
 from walop_jax.commands.refit import STAGES, refit
 from walop_jax.io.errors import fail
 
@@ -40,7 +40,6 @@ def demo(job: Job, *, output: PathLike = "walop-jax-demo") -> Outcome[FitResult]
     page = command_of(report).run(job, {"run": run}).value.path
     pull = _stars(job, run, folder)
     places = {"run": str(run), "page": str(page), "stars": str(folder / CORRECTED)}
-    diagnosis = f"walop-jax diagnose {calset} -o {folder}/DIAGNOSIS"
     return Outcome(
         fit.value,
         {**places, "pull": pull, "summary": fit.content},
@@ -48,7 +47,10 @@ def demo(job: Job, *, output: PathLike = "walop-jax-demo") -> Outcome[FitResult]
         f"q and u differ from the truth by {pull:.2f} of their errors (rms)",
         warnings=fit.warnings,
         trusted=fit.trusted,
-        next=(f"walop-jax matrix {run} --x 0.1 --y 0.2", diagnosis),
+        next=(
+            typed("matrix", run, "--x", "0.1", "--y", "0.2"),
+            typed("diagnose", calset, "-o", folder / "DIAGNOSIS"),
+        ),
     )
 
 

@@ -6,11 +6,13 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, text_file
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, typed
 from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects
+from walop_jax.io.folder import output_folder
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
 from walop_jax.io.progress import repeated
+from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -50,6 +52,8 @@ def diagnose(
     from walop_jax.diagnosis.workflow import diagnose as diagnosis_of
 
     if why is not None:
+        if output is not None:
+            raise UsageError("an answer is printed, not written: leave it out beside --why", "output")
         return _why(why, data)
     if job.typed and output is None:
         raise UsageError("Missing option '--output' / '-o'.", "output")
@@ -80,7 +84,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
         job.tell("mapping the field", "mapping")
         misfit = None if after.explains_data else describe(after)
         fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
-        text_file(json_text(fitted | {"shown": after.display().document()}))(path)
+        path.write_text(json_text(fitted | {"shown": after.display().document()}), encoding="utf-8")
 
     return Outcome(
         found,
@@ -91,19 +95,18 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
             SUMMARY: write_summary,
             PRODUCT: lambda path: write_calibration(path, product),
             FIGURE_DATA: lambda path: write_figure_data(path, figure_data(found)),
-            MODEL: lambda path: path.write_text(render(after.model), encoding="utf-8"),
+            MODEL: render(after.model),
         },
         saved_as=DIAGNOSIS,
         warnings=after.warnings,
         trusted=usable,
-        next=(f"walop-jax report {output}", *[f"walop-jax apply {output} STARS.fits -o OUT.fits"] * usable),
+        next=(typed("report", output), *[typed("apply", output, "STARS.fits", "-o", "OUT.fits")] * usable),
     )
 
 
 def _why(name: str, data: Sets) -> Outcome[Any]:
     """The answer of a run to why something was not named."""
     from walop_jax.diagnosis.reasons import why
-    from walop_jax.io.run_folder import RunFolder
 
     paths = paths_of(data)
     if len(paths) != 1:
@@ -116,7 +119,5 @@ def _why(name: str, data: Sets) -> Outcome[Any]:
 
 def write(found: Diagnosis, folder: PathLike, *, overwrite: bool = False) -> None:
     """Write a diagnosis as the folder that the command makes."""
-    from walop_jax.io.folder import output_folder
-
     with output_folder(folder, OUTPUTS, overwrite=overwrite) as out:
         outcome_of(Job(), found, folder).save(out)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import Sets, set_of
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
+from walop_jax.io.names import EPOCH, PRODUCT
 
 if TYPE_CHECKING:
     from walop_jax.science.epoch import Epoch
 
-OUTPUTS = ("calibration.fits", "epoch.json")
 
-
-@command(stages=("reading", "fitting", "lacking"), writes=OUTPUTS, random=True)
+@command(stages=("reading", "fitting", "lacking"), writes=(PRODUCT, EPOCH), random=True)
 def epoch(
     job: Job, old: Product, new: Sets, *, output: PathLike | None = None, effects: Effects = None
 ) -> Outcome[Epoch]:
@@ -43,7 +42,8 @@ def epoch(
     from walop_jax.science.epoch import fit_like
 
     job.begin("reading")
-    held, calset = calibration_of(old, effects), set_of(new)
+    held = calibration_of(old, effects)
+    calset = set_of(new, held.design)
     job.tell("fitting the new set", "fitting")
     with errors_naming(held.path):
         result = examined(fit_like(held, calset), job.seed)
@@ -74,8 +74,9 @@ def epoch(
             "diagnosis": None if lacking is None else document(lacking),
         },
         display=shown,
-        files={OUTPUTS[0]: lambda path: write_calibration(path, Calibration.from_fit(result))},
-        saved_as=OUTPUTS[1],
+        files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result))},
+        saved_as=EPOCH,
         warnings=[f"the new fit: {w}" if w in result.warnings else w for w in comparison.warnings],
         trusted=comparison.holds,
+        next=(typed("report", output),),
     )

@@ -9,7 +9,7 @@ from typing import Any
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
 
 
-@command(writes="file", jax=False)
+@command(writes="table", jax=False)
 def exposures(
     job: Job,
     files: PathLike | Sequence[PathLike],

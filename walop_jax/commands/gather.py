@@ -8,15 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed
 from walop_jax.commands.inputs import InstrumentLike, design_of
+from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax.data.camera_catalogues import CameraCatalogue
     from walop_jax.sky.directions import Pointing
 
 
-@command(stages=("reading", "matching", "writing"), writes="file", jax=False)
+@command(stages=("reading", "matching", "writing"), writes="table", jax=False)
 def gather(
     job: Job,
     catalogues: Sequence[PathLike],
@@ -45,13 +46,11 @@ def gather(
     """
     from walop_jax.data.camera_catalogues import read_camera_catalogue
     from walop_jax.data.header_words import read_words
-    from walop_jax.io.plain_tables import astropy_table, table_format, write_table
+    from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.gathering import gather as gathered
     from walop_jax.science.gathering import identified
 
-    if output is not None:
-        table_format(output)
     catalogues = several(catalogues)
     design = design_of(instrument) or nominal_instrument()
     names = design.cameras.names
@@ -84,8 +83,8 @@ def gather(
     document = {"output": output, "stars": len(table), "in_all_cameras": by_cameras[-1], "pointing": cards}
     document |= {"registrations": moved, "remarks": remarks}
     text = f"{output}: {len(table)} stars, {by_cameras[-1]} of them in all {len(names)} cameras"
-    next_step = f"walop-jax apply RUN {output} -o OUT.fits"
-    return Outcome(table, document, text, warnings=remarks, next=(next_step,))
+    apply = typed("apply", "RUN", output, "-o", "OUT.fits")
+    return Outcome(table, document, text, warnings=remarks, next=(apply,))
 
 
 def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
@@ -94,9 +93,8 @@ def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
     for path, name in zip(catalogues, names, strict=True):
         stated = telling & set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))
         if len(stated) == 1 and name.upper() not in stated:
-            what = f"{path} is given in the place of camera {name}"
-            what += f": the order is {', '.join(names)}; rename it if it is of {name}"
-            raise UsageError(what, "catalogues")
+            order = f"the order is {', '.join(names)}; rename it if it is of {name}"
+            raise UsageError(f"{path} is given in the place of camera {name}: {order}", "catalogues")
 
 
 def _pointing(
@@ -104,25 +102,24 @@ def _pointing(
 ) -> tuple[Pointing, list[str]]:
     """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last."""
     from walop_jax.data.camera_catalogues import angle_of, centre_of
-    from walop_jax.io.errors import fail
     from walop_jax.sky.directions import Pointing
 
     first, remarks = catalogues[0], []
-    header = {name: angle_of(first, name) for name, value in given.items() if value is None}
-    numbers = {name: header[name] if value is None else float(value) for name, value in given.items()}
+    numbers = {name: angle_of(first, name) if value is None else value for name, value in given.items()}
     missing = [name for name, value in numbers.items() if value is None]
-    if missing and (from_wcs := centre_of(first.header)) is not None:
+    if missing:
+        from_wcs = centre_of(first.header)
+        if from_wcs is None:
+            what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
+            advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
+            raise fail(what, file=first.path, advice=advice)
         numbers |= {name: from_wcs[name] for name in missing}
         stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
         remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
-        missing = []
-    if missing:
-        what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
-        advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
-        raise fail(what, file=first.path, advice=advice)
-    values = [float(numbers[name]) for name in ("RA", "DEC", "ROTATOR")]  # pyright: ignore[reportArgumentType]
-    for name, value, limit in zip(("RA", "DEC", "ROTATOR"), values, (360.0, 90.0, 360.0), strict=True):
+    values = {name: float(value) for name, value in numbers.items() if value is not None}
+    for name, value in values.items():
+        limit = 90.0 if name == "DEC" else 360.0
         if not abs(value) <= limit:
             what = f"{name} of the field centre is {value:g} deg"
             raise fail(what, file=first.path, advice=f"at most {limit:g} deg")
-    return Pointing(*values), remarks
+    return Pointing(*values.values()), remarks

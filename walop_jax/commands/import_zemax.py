@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, typed
 from walop_jax.io.errors import nearest
 
 if TYPE_CHECKING:
@@ -58,4 +58,5 @@ def import_zemax(
     document |= {"exposures": exposures, "points": points, "rows": rows, "remarks": list(design.remarks)}
     text = f"{output}: {design.instrument}, {len(wavelengths)} wavelengths, {exposures} exposures of {points} points"
     text += f", {rows} rows to use"
-    return Outcome(design, document, text, warnings=design.remarks)
+    refit = typed("refit", output, "-o", "RUN")
+    return Outcome(design, document, text, warnings=design.remarks, next=(refit,))

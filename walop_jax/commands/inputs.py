@@ -12,9 +12,11 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 from walop_jax.commands.command import PathLike, UsageError, several
-from walop_jax.commands.products import Effects, calibration_of, catalogue_of, path_of
+from walop_jax.commands.products import Effects, calibration_of, catalogue_of, is_product, path_of
 from walop_jax.io.errors import DataError, errors_naming, fail
-from walop_jax.io.text import read_text
+from walop_jax.io.folder import output_folder
+from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT, SUMMARY
+from walop_jax.io.text import json_text, read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
@@ -43,7 +45,6 @@ def read(
     from walop_jax.calibration.product import read_calibration
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.io.fits_reading import primary_keywords
-    from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT
     from walop_jax.model.elements.registry import load_elements
 
     if elements is not None:
@@ -69,7 +70,7 @@ def design_of(instrument: InstrumentLike) -> Instrument | None:
     if instrument is None or isinstance(instrument, Instrument):
         return instrument
     path = path_of(instrument, "an instrument", "its name, its description file, or an Instrument")
-    if path.is_dir() or path.suffix == ".fits":
+    if is_product(path):
         return calibration_of(path).design
     return Instrument.read(instrument, elements=defined_elements())
 
@@ -148,9 +149,6 @@ def save(
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
-    from walop_jax.io.folder import output_folder
-    from walop_jax.io.names import PRODUCT, SUMMARY
-    from walop_jax.io.text import json_text
 
     held = result.calibration if isinstance(result, Run) else result
     if held is None:

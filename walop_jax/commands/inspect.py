@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, command
+from walop_jax.commands.command import Job, Outcome, command, typed
 from walop_jax.commands.inputs import Sets, paths_of
 from walop_jax.commands.products import IN_MEMORY
 from walop_jax.io.display import Display, Displayed
@@ -80,9 +80,10 @@ def inspect(job: Job, data: Sets) -> Outcome[InspectedSets]:
     joint = inspection_of(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
     inspected = InspectedSets(tuple(sets), joint, tuple(faults))
     strange = any(inspection.instrument not in shipped() for inspection in inspected.inspections)
+    needed = ("CALSET", "--instrument", "FILE.toml") if strange else paths
     return Outcome(
         inspected,
         text="\n".join(inspection.display().text() for inspection in inspected.inspections),
         failure="; ".join(faults),
-        next=("walop-jax refit CALSET --instrument FILE.toml -o RUN",) if strange else (),
+        next=(typed("refit", *needed, "-o", "RUN"),),
     )

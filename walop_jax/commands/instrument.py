@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, command
 from walop_jax.io.errors import errors_naming
 
 
@@ -26,9 +26,10 @@ def instrument(job: Job, source: PathLike | None = None, *, text: bool = False) 
     from walop_jax.instruments.description import described, read_description, shipped
 
     if source is None:
-        names = {name: described(name).about for name in shipped()}
-        width = max(map(len, names))
-        return Outcome(names, names, "\n".join(f"{name:<{width}}  {about}" for name, about in names.items()))
+        if text:
+            raise UsageError("name the instrument whose description is wanted", "source")
+        names = Listing({name: described(name).about for name in shipped()})
+        return Outcome(names, names, repr(names))
     if text:
         written = read_description(source).text
         return Outcome(written, {"name": str(source), "text": written}, written)

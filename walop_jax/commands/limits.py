@@ -7,23 +7,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, paths_of, set_and_model
-from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
+from walop_jax.commands.products import Effects, catalogue_of, fit_of
+from walop_jax.io.names import LIMITS, PRODUCT
 
 if TYPE_CHECKING:
-    from walop_jax import CalibrationSet, FitResult, ObservingPlan
+    from walop_jax import FitResult, ObservingPlan
     from walop_jax.diagnosis.detection_limits import DetectionLimits
+    from walop_jax.diagnosis.findings import Diagnosis
 
-OUTPUTS = ("limits.json", "limits_protection.png", "limits_separation.png")
+PROTECTION, SEPARATION = "limits_protection.png", "limits_separation.png"
 
 
 @command(
-    stages=("reading", "fitting", "differentiating", "comparing", "unnoticed"), writes=OUTPUTS, random=True
+    stages=("reading", "fitting", "differentiating", "comparing", "unnoticed"),
+    writes=(LIMITS, PROTECTION, SEPARATION),
+    random=True,
 )
 def limits(
     job: Job,
-    data: FitResult | Diagnosed | ObservingPlan | CalibrationSet | PathLike | Sequence[PathLike],
+    data: FitResult | Diagnosis | ObservingPlan | Sets,
     model: ModelLike = None,
     *,
     output: PathLike | None = None,
@@ -49,12 +53,12 @@ def limits(
     from walop_jax.simulation.simulate import as_planned
 
     job.begin("reading")
-    data = fit_of(data)
+    data, plan_file = fit_of(data), None
     plan = data if isinstance(data, ObservingPlan) else None
     if isinstance(data, str | os.PathLike | Sequence):
         paths = paths_of(data)
         if len(paths) == 1 and is_plan(paths[0]):
-            plan = read_plan(paths[0], instrument)  # pyright: ignore[reportArgumentType]
+            plan_file, plan = paths[0], read_plan(paths[0], instrument)  # pyright: ignore[reportArgumentType]
     if isinstance(data, FitResult):
         result = data
     else:
@@ -66,10 +70,10 @@ def limits(
         raise ValueError(f"the fit did not converge ({result.minimum.message})")
     effect_kinds = None if effects is None else catalogue_of(effects)
     limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
-    suggested = ()
+    steps = ()
     if output is not None:
-        suggested = (f"walop-jax report {output}", *_plan(data, output, instrument, result))
-    figures = map(figure_file, (protection_figure, separation_figure), (limits_of_data, limits_of_data))
+        available = plan_file or instrument or result.model.name
+        steps = typed("report", output), _plan(available, Path(output), result)
     return Outcome(
         limits_of_data,
         extra={
@@ -80,22 +84,20 @@ def limits(
             "trusted": result.trusted,
             "seed": job.seed,
         },
-        files=dict(zip(OUTPUTS[1:], figures, strict=True)),
-        saved_as=OUTPUTS[0],
-        next=suggested,
+        files={
+            PROTECTION: figure_file(protection_figure, limits_of_data),
+            SEPARATION: figure_file(separation_figure, limits_of_data),
+        },
+        saved_as=LIMITS,
+        next=steps,
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )
 
 
-def _plan(data: object, output: PathLike, instrument: object, result: FitResult) -> Sequence[str]:
-    """The command that plans better exposures: beside a fit, of the plan that was given, or of the instrument."""
-    from walop_jax.io.names import PRODUCT
-    from walop_jax.simulation.observing_plan import is_plan
-
+def _plan(available: object, output: Path, result: FitResult) -> str:
+    """The command that plans better exposures: beside a fit, or of what is `available`."""
     if len(result.model.template.cameras.pairs) != 2:
-        return ()  # which error is to be small is for the user to say
-    if (Path(output) / PRODUCT).exists():
-        return (f"walop-jax plan {output} --minutes 10",)
-    paths = [str(path) for path in data] if isinstance(data, list) else []
-    where = paths[0] if len(paths) == 1 and is_plan(paths[0]) else instrument or result.model.name
-    return (f"walop-jax plan {where} --minutes 30",)
+        return ""  # which error is to be small is for the user to say
+    if (output / PRODUCT).exists():
+        return typed("plan", output, "--minutes", "10")
+    return typed("plan", available, "--minutes", "30")

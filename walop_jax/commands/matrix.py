@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, typed
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming, fail, nearest
 
 
-@command(writes="file")
+@command(writes="table")
 def matrix(
     job: Job,
     calibration: products.Product,
@@ -50,20 +50,17 @@ def matrix(
     """
     from walop_jax.calibration.matrix_table import MatrixTable
     from walop_jax.fit.verdict import Quality
-    from walop_jax.io.plain_tables import table_format
     from walop_jax.posterior.draws import with_draws
     from walop_jax.science.field_points import field_points
 
-    if (points is None) == (x is None):
+    if (points is None) == (x is None and y is None):
         raise UsageError("give either x and y, or a table of points", "points")
-    if points is None and y is None:
+    if points is None and (x is None or y is None):
         raise UsageError("a field point needs both x and y", "y")
     if job.typed and points is not None and output is None:
         if "," in str(points) and not Path(points).exists():
             raise UsageError("it is no table; a single field point is --x 0.1 --y 0.2", "points")
         raise UsageError("name the table to be written", "output")
-    if output is not None:
-        table_format(output)
     held = products.calibration_of(calibration, effects)
     instrument = held.model.template.patched()
     moving, columns = instrument.moving(), {}
@@ -100,7 +97,7 @@ def matrix(
     result.meanings = {int(bit): bit.meaning for bit in Quality}
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     text = f"{output}: {table.rows} rows, {crossed} of them in zones of high cross-talk"
-    advice = ("walop-jax matrix RUN --points TABLE -o OUT.fits",) if output is None else ()
+    advice = (typed("matrix", "RUN", "--points", "TABLE", "-o", "OUT.fits"),) if output is None else ()
     return dataclasses.replace(
         outcome, value=result, text=str(result) if output is None else text, next=advice
     )

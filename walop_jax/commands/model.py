@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed, write_text
 from walop_jax.commands.inputs import InstrumentLike, design_of, set_of
 from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.display import Display, Displayed
@@ -59,7 +59,6 @@ def model(
     """
     from walop_jax.fit.base_model import model_for
     from walop_jax.fit.model_file import effects_text, model_without_data, render
-    from walop_jax.io.atomic import atomic_path
     from walop_jax.model.instrument import nominal_instrument
 
     catalogue = catalogue_of(effects)
@@ -71,7 +70,8 @@ def model(
         base = model_without_data(design or nominal_instrument(), changes, catalogue=catalogue)
     text = render(base)
     if output is not None:
-        with atomic_path(output, overwrite=job.overwrite) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(output, text, overwrite=job.overwrite)
+    options = given(instrument=instrument, effects=effects, elements=job.elements)
+    refit = typed("refit", *several(calsets), *options, "--model", output, "-o", "RUN")
     model_file = ModelFile(base, text, None if output is None else Path(output))
-    return Outcome(model_file, text=text if output is None else None)
+    return Outcome(model_file, text=text if output is None else None, next=(refit,) if calsets else ())

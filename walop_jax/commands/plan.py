@@ -10,26 +10,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, text_file
-from walop_jax.commands.products import Effects, calibration_of, catalogue_of
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed, write_text
+from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, is_product
 from walop_jax.commands.standards import LOWEST
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
+from walop_jax.io.names import DIAGNOSIS, PLANNED
 from walop_jax.io.progress import repeated
+from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, ObservingPlan, Run
+    from walop_jax import Calibration, ObservingPlan
     from walop_jax.data.records import Exposures
-    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.plans.plan import ExposurePlan
 
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 MOST_ANGLES = 24  # of a moving element, where a plan takes them from a run
 
 
-@command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, "plan.json"), random=True)
+@command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, PLANNED), random=True)
 def plan(
     job: Job,
-    available: ObservingPlan | FitResult | Calibration | Diagnosis | Run | PathLike,
+    available: ObservingPlan | Product,
     *,
     minutes: float = 30.0,
     candidates: Any = None,
@@ -58,34 +61,38 @@ def plan(
     from walop_jax import ObservingPlan
     from walop_jax.data.kinds import CALIBRATION_PLATE
     from walop_jax.data.user_tables import read_input_table
-    from walop_jax.io.names import PLANNED
     from walop_jax.plans.available import Available
     from walop_jax.plans.criteria import check_wishes
     from walop_jax.plans.plan import plan_exposures
     from walop_jax.simulation.observing_plan import plan_text
 
     check_wishes(minutes, goal, draws)
-    if not isinstance(available, str | Path | ObservingPlan) or (
-        available != "" and Path(str(available)).is_dir()
-    ):
+    if schedule is not None:
+        check_output(schedule, overwrite=job.overwrite)
+    elif words is not None:
+        raise UsageError("these are words of a schedule; see --schedule", "words")
+    is_plan = isinstance(available, ObservingPlan) or available == ""
+    if not is_plan and (not isinstance(available, str | os.PathLike) or is_product(available)):
+        if after is not None:
+            raise UsageError("one calibration can be added to: the RUN, or that of --after", "after")
         after, available = available, ""
     prior = None if after is None else calibration_of(after, effects)
     catalogue = catalogue_of(effects) if effects is not None or prior is None else prior.model.catalogue
-    alike = (apart,) if isinstance(apart, str) else tuple(apart or ())
+    alike = tuple(several(apart or ()))
     if criterion == "apart" and not alike:
         if prior is None:
             raise UsageError("give the effects to be separated, or a RUN of diagnose", "apart")
         alike = _alike(after, prior)
-    if candidates is not None:
-        available = candidates
-    elif available == "" and prior is not None:
+    if candidates is None and available == "" and prior is not None:
         others = (prefix for prefix in prior.design.moving() if prefix != CALIBRATION_PLATE)
         moving = {prefix: _stood_at(prior.exposures, prefix) for prefix in others}
         design = prior.design if prior.design.description else prior.instrument
         available = ObservingPlan(design, moving=moving)
     table = Path(str(criterion))
     chosen = read_input_table(criterion) if table.suffix and table.exists() else criterion
-    possible = Available.of(available)  # pyright: ignore[reportArgumentType]
+    possible = Available.of(available if candidates is None else candidates)  # pyright: ignore[reportArgumentType]
+    if candidates is not None and str(available).upper() not in ("", name := possible.plan.name):
+        raise UsageError(f"these are for {name}: beside them give {name}, or a RUN of it", "candidates")
     job.tell("information of exposures", "information")
     possible = possible if schedule is None else possible.in_whole_seconds()
     with repeated(job.progress) as say:
@@ -99,17 +106,23 @@ def plan(
                 planned = best(dataclasses.replace(possible, throughout=minutes))
     described = planned.observing_plan.design.description
     toml = plan_text(planned.observing_plan, INSTRUMENT if described else None)
-    files = {PLAN: text_file(toml), INSTRUMENT: text_file(described) if described else None}
-    remarks = () if schedule is None else scheduled(job, planned.observing_plan, schedule, words)
-    return Outcome(planned, extra={"seed": job.seed}, files=files, saved_as=PLANNED, warnings=remarks)
+    steps = ()
+    if output is not None:
+        steps = typed("report", output), typed("simulate", Path(output) / PLAN, "-o", "SET.fits")
+    return Outcome(
+        planned,
+        extra={"seed": job.seed},
+        files={PLAN: toml, INSTRUMENT: described or None},
+        saved_as=PLANNED,
+        warnings=() if schedule is None else scheduled(job, planned.observing_plan, schedule, words),
+        next=steps,
+    )
 
 
 def scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike | None) -> Sequence[str]:
     """Write the exposures of a plan as a schedule; filters are numbered in their order unless `words` number them."""
     from walop_jax.data.header_words import Words, read_words
     from walop_jax.data.schedule import schedule_of
-    from walop_jax.io.atomic import atomic_path
-    from walop_jax.io.text import json_text
 
     rules = Words({}) if words is None else read_words(words)
     numbers = rules.filters or {name: k for k, name in enumerate(planned.filter_names, start=1)}
@@ -130,8 +143,7 @@ def scheduled(job: Job, planned: ObservingPlan, path: PathLike, words: PathLike 
         exposures, planned.site, numbers, facts=rules.schedule, names=names, unpolarised=unpolarised
     )
     remarks += further
-    with atomic_path(path, overwrite=job.overwrite) as temporary:
-        temporary.write_text(json_text(document), encoding="utf-8")
+    write_text(path, json_text(document), overwrite=job.overwrite)
     if not rules.filters:
         listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
         remarks.append(f"{path}: filters are numbered in their order ({listed}); --words gives other numbers")
@@ -187,8 +199,6 @@ def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
 def _alike(after: Any, known: Calibration) -> tuple[Any, ...]:
     """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name."""
     from walop_jax.diagnosis.findings import Diagnosis, document
-    from walop_jax.io.names import DIAGNOSIS
-    from walop_jax.io.run_folder import RunFolder
 
     diagnosis, path = document(after) if isinstance(after, Diagnosis) else None, None
     if isinstance(after, RunFolder | str | os.PathLike):

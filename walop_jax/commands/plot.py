@@ -7,22 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, check_picture, command
 from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax.reports.run import Drawable
-
-FORMATS = (".pdf", ".png", ".svg", ".eps", ".jpg")
-
-
-class Figures(dict[str, str]):
-    """Figures by name, printed as a line each."""
-
-    def __repr__(self) -> str:
-        width = max(map(len, self), default=0)
-        return "\n".join(f"{name:<{width}}  {about}" for name, about in self.items())
 
 
 @command(writes=())
@@ -60,7 +50,6 @@ def plot(
     >>> figure = walop.plot(result, "modulation", x=0.1, y=0.0)
     """
     from walop_jax import Run
-    from walop_jax.io.atomic import check_output
     from walop_jax.io.run_folder import OF_A_FIT
     from walop_jax.reports.named import FIGURES, draw, possible
     from walop_jax.reports.posterior_figures import save_figure
@@ -72,15 +61,15 @@ def plot(
     if isinstance(held, Run) and not held.folder.is_dir():
         raise fail("is not the folder of a run", file=held.folder, advice=OF_A_FIT)
     if held is None or name is None:
+        if output is not None:
+            raise UsageError("give the name of the figure as well", "name")
         every = {key: texts("figures")[key] for key in FIGURES}
-        listed = Figures(every if held is None else possible(FigureSource.of(held)))
+        listed = Listing(every if held is None else possible(FigureSource.of(held)))
         return Outcome(listed, listed, repr(listed))
     chosen = f"{name}.png" if output is None and job.typed else output
     path = None if chosen is None else Path(chosen)
     if path is not None:
-        if path.suffix.lower() not in FORMATS:
-            raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(FORMATS)}")
-        check_output(path, overwrite=job.overwrite)
+        check_picture(path, overwrite=job.overwrite)
     if isinstance(parameters, str):
         parameters = [word.strip() for word in parameters.split(",") if word.strip()]
     job.tell(f"drawing {name}")

@@ -11,7 +11,7 @@ import os
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from walop_jax.commands.command import PathLike, UsageError
 from walop_jax.fit.parameter_table import Fitted
@@ -19,17 +19,9 @@ from walop_jax.io.text import in_ascii
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, FitResult, Run
+    from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.effects import EffectKind
     from walop_jax.posterior.result import PosteriorSample
-
-
-class Diagnosed(Protocol):
-    """A result with a last fit: a diagnosis."""
-
-    @property
-    def after(self) -> FitResult:
-        """That fit, of which the calibration is that of the diagnosis."""
-        ...
 
 
 IN_MEMORY = "in memory"  # in place of the path of a file
@@ -38,8 +30,8 @@ NOT_CARRIED_OVER = "not_carried_over"
 """Key under which results in JSON list the effects of a model that had to be left out."""
 
 Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
-Product: TypeAlias = "Calibration | FitResult | Diagnosed | Run | PathLike"
-OptionalProduct: TypeAlias = "Calibration | FitResult | Diagnosed | Run | PathLike | None"
+Fit: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
+Product: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
 Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
 Angles: TypeAlias = "Mapping[str, float] | Sequence[str] | None"
 
@@ -83,6 +75,11 @@ def folder_of(run: Run | PathLike) -> Path:
     """The folder of a run, or whatever else a path names."""
     advice = "a fit, a Run, or the path of a folder or a product"
     return path_of(getattr(run, "folder", run), "a run or a calibration", advice)
+
+
+def is_product(path: PathLike) -> bool:
+    """True for the folder of a run, and for a file that can be a calibration by its name."""
+    return Path(path).is_dir() or Path(path).suffix == ".fits"
 
 
 def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib
 import inspect
 import os
-import re
-import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,8 +16,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from walop_jax.commands import COMMANDS, GROUPS, INTERRUPTED, is_interrupt, line_of
-from walop_jax.commands.command import COMMON, Argument, Command, Job, Option, Outcome, UsageError, command_of
+from walop_jax.commands.command import COMMON, Command, Job, Option, UsageError, command_of
+from walop_jax.io.code import versions_of
 from walop_jax.io.progress import interrupts_answered
+from walop_jax.io.text import json_text
 
 STARTED = time.perf_counter()
 DEBUG_VARIABLE = "WALOP_JAX_DEBUG"
@@ -33,23 +32,6 @@ EXIT_CODES = (
     "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 3 done, "
     "but the result is not to be trusted; 130 interrupted."
 )
-NEXT = {
-    "inspect": ("walop-jax refit {data} -o RUN",),
-    "simulate": ("walop-jax refit {output} -o RUN",),
-    "clip": ("walop-jax refit {output} -o RUN",),
-    "import_zemax": ("walop-jax refit {output} -o RUN",),
-    "model": ("walop-jax refit {calsets} --instrument {instrument} --model {output} -o RUN",),
-    "sample": ("walop-jax report {fit}",),
-    "plan": ("walop-jax report {output}", "walop-jax simulate {output}/plan.toml -o SET.fits"),
-    "compare": ("walop-jax report {output}",),
-    "epoch": ("walop-jax report {output}",),
-    "apply": ("walop-jax watch {calibration} {output} -o WATCH",),
-    "watch": ("walop-jax report {output}",),
-    "report": ("open the page in a browser",),
-    "certify": ("walop-jax apply {calibration} STARS.fits -o OUT.fits",),
-}
-"""Commands to type next, where a command itself does not say; names are those of its arguments."""
-
 PRINTED = "prints its result and takes no output: keep it with > FILE, with --json for programs"
 KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
 INTO_ARGUMENT = "writes into the folder that it is given: leave -o out"
@@ -79,14 +61,14 @@ class _Commands(TyperGroup):
 class _OneCommand(TyperCommand):
     """A command: where it takes no output, its complaint about -o states what becomes of the result."""
 
-    advice = ""
+    advice = ""  # none where there is an output
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """The arguments, parsed by typer."""
         try:
             return super().parse_args(ctx, args)
         except Exception as error:
-            if str(getattr(error, "option_name", "")).startswith(("-o", "--out")):
+            if self.advice and str(getattr(error, "option_name", "")).startswith(("-o", "--out")):
                 complaint = f"{ctx.info_name} {self.advice}"
                 raise typer.BadParameter(complaint, ctx, param_hint="--output") from None
             raise
@@ -107,8 +89,6 @@ app = typer.Typer(
 
 def _show_version(wanted: bool) -> bool:
     if wanted:
-        from walop_jax.io.code import versions_of
-
         typer.echo(versions_of(["walop-jax"])["walop-jax"])
         raise typer.Exit
     return wanted
@@ -139,44 +119,36 @@ def _parameter(name: str, option: Option, default: Any, hidden: bool = False) ->
     needed = default is inspect.Parameter.empty or option.required
     if default is None and not option.required:
         kind = kind | None
-    shown: dict[str, Any] = {"help": option.help, "metavar": option.metavar, "hidden": hidden}
-    shown |= {} if option.least is None else {"min": option.least}
-    if isinstance(option, Argument):
-        note = typer.Argument(**shown)
-    else:
-        note = typer.Option(*filter(None, (f"--{name.replace('_', '-')}", option.short)), **shown)
+    shown: Any = {"help": option.help, "metavar": option.metavar, "hidden": hidden, "min": option.least}
+    words = filter(None, (option.spelled(name), option.short))
+    note = typer.Argument(**shown) if option.placed else typer.Option(*words, **shown)
     given = inspect.Parameter.empty if needed else default
     return inspect.Parameter(name, KEYWORD_ONLY, default=given, annotation=Annotated[kind, note])
 
 
 def _command(name: str) -> Any:
-    """A command as typer makes it."""
+    """A command as typer makes it, of a function whose signature is made of the options."""
     word = name.replace("-", "_")
     command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
-    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    page = _paragraphs(command.body)
-    alone.command(name, cls=_OneCommand, context_settings=HELP, help=page)(_function(command))
-    made: Any = typer.main.get_command(alone)
-    made.advice = PRINTED if command.writes is None else INTO_ARGUMENT
-    return made
-
-
-def _function(command: Command[Any]) -> Callable[..., None]:
-    """Function that typer calls: its signature is made of the options of a command."""
     options = command.described
     parameters = [
-        _parameter(name, options[name], p.default, hidden=name == "seed" and not command.random)
-        for name, p in command.signature.parameters.items()
-        if name in options
+        _parameter(key, options[key], p.default, hidden=key == "seed" and not command.random)
+        for key, p in command.signature.parameters.items()
+        if key in options
     ]
-    parameters += [_parameter(name, options[name], False) for name in ("quiet", "json")]
+    parameters += [_parameter(key, options[key], False) for key in ("quiet", "json")]
 
     def run(**given: Any) -> None:
         _guarded(command, given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    alone.command(name, cls=_OneCommand, context_settings=HELP, help=_paragraphs(command.body))(run)
+    made: Any = typer.main.get_command(alone)
+    if "output" not in command.options:
+        made.advice = PRINTED if command.writes is None else INTO_ARGUMENT
+    return made
 
 
 def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
@@ -186,28 +158,21 @@ def _guarded(command: Command[Any], given: dict[str, Any]) -> None:
             _run(command, given)
             sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of stdout has gone (`| head`): not an error, and Python must not complain at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(1) from None
-    except KeyboardInterrupt:
-        raise typer.Exit(_interrupted()) from None
-    except MemoryError:
-        complain("out of memory: use fewer field points, or a machine with more")
-        raise typer.Exit(1) from None
+        raise  # the reader of stdout has gone (`| head`): typer ends the program without a word
     except UsageError as error:
-        option = error.option and (
-            error.option.upper() if isinstance(command.options.get(error.option), Argument)
-            else f"--{error.option.replace('_', '-')}"
-        )  # fmt: skip
+        option = error.option and command.options.get(error.option, Option("")).spelled(error.option)
         raise typer.BadParameter(str(error), param_hint=option) from None
-    except Exception as error:
-        if is_interrupt(error):  # that came while a compiled library was imported
+    except (KeyboardInterrupt, Exception) as error:
+        if is_interrupt(error):
             raise typer.Exit(_interrupted()) from None
         if os.environ.get(DEBUG_VARIABLE) or type(error).__module__.split(".")[0] in ("typer", "click"):
             raise
-        expected = isinstance(error, ValueError | OSError)
-        hint = "" if expected else f" (unexpected {type(error).__name__}; {DEBUG_VARIABLE}=1 shows where)"
-        complain(f"{error}{hint}")
+        if isinstance(error, MemoryError):
+            complain("out of memory: use fewer field points, or a machine with more")
+        elif isinstance(error, ValueError | OSError):
+            complain(str(error))
+        else:
+            complain(f"{error} (unexpected {type(error).__name__}; {DEBUG_VARIABLE}=1 shows where)")
         raise typer.Exit(1) from None
 
 
@@ -218,6 +183,7 @@ def _interrupted() -> int:
 
 
 def _run(command: Command[Any], given: dict[str, Any]) -> None:
+    """Run a command and print its outcome; a failure, or a result that is not to be trusted, ends the program."""
     quiet, json = given.pop("quiet"), given.pop("json")
     common = {name: given.pop(name) for name in COMMON if name in given}
     if command.jax:
@@ -226,36 +192,22 @@ def _run(command: Command[Any], given: dict[str, Any]) -> None:
         switch_on()
     with progress(quiet or json, command.stages) as tell:
         outcome = command.run(Job(progress=tell, typed=True, **common), given)
-    _show(dataclasses.replace(outcome, next=outcome.next or _next_steps(command, given)), quiet, json)
-
-
-def _next_steps(command: Command[Any], given: dict[str, Any]) -> tuple[str, ...]:
-    """The lines of `NEXT` for the given arguments; those that need an output which was not written are left out."""
-    texts = ((name, value if isinstance(value, list) else [value]) for name, value in given.items())
-    words = {name: shlex.join(map(str, values)) for name, values in texts if values != [None]}
-    lines = NEXT.get(command.name, ())
-    return tuple(line.format_map(words) for line in lines if set(re.findall(r"{(\w+)}", line)) <= set(words))
-
-
-def _show(found: Outcome[Any], quiet: bool, json: bool) -> None:
-    """Print an outcome, and end with its exit code."""
-    text = "" if quiet or json else found.printed()
+    text = "" if quiet or json else outcome.printed()
     if json:
-        from walop_jax.io.text import json_text
-
-        typer.echo(json_text(found.content), nl=False)
+        typer.echo(json_text(outcome.content), nl=False)
     elif text:
-        _print(text, found.markdown)
-    for sentence in found.warnings:
+        _print(text, outcome.markdown)
+    for sentence in outcome.warnings:
         complain(sentence, "warning")
-    if text and found.next and not found.failure:
+    steps = " or ".join(filter(None, outcome.next))
+    if text and steps and not outcome.failure:
         # On stderr: stdout may be redirected into a file.
-        typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {' or '.join(found.next)}", err=True)
-    if found.failure:
+        typer.echo(f"Done in {seconds_since_start():.0f} s. Next: {steps}", err=True)
+    if outcome.failure:
         sys.stdout.flush()
-        complain(found.failure)
+        complain(outcome.failure)
         raise typer.Exit(1)
-    if not found.trusted:
+    if not outcome.trusted:
         raise typer.Exit(UNTRUSTED)
 
 

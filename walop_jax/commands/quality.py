@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, several
-from walop_jax.commands.products import Diagnosed, Effects, calibration_of
+from walop_jax.commands.command import Job, Outcome, PathLike, check_picture, command, several
+from walop_jax.commands.products import Effects, Product, calibration_of
+from walop_jax.io.atomic import check_output
 from walop_jax.io.display import Display
-
-if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+from walop_jax.io.run_folder import RunFolder
 
 SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 
@@ -20,7 +19,7 @@ SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 @command(stages=("reading", "writing"))
 def quality(
     job: Job,
-    runs: Calibration | FitResult | Diagnosed | Run | PathLike | Sequence[Any],
+    runs: Product | Sequence[Product],
     *,
     output: PathLike | None = None,
     limits: PathLike | None = None,
@@ -39,9 +38,7 @@ def quality(
 
     >>> walop.quality("RUN")["CHI2DOF", "OUTSIDE"]  # doctest: +SKIP
     """
-    from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.io.run_folder import RunFolder
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
     from walop_jax.science.quality import OUTSIDE, append, quality_row, read_limits, table_of_nights
@@ -51,7 +48,7 @@ def quality(
         check_output(output, overwrite=True)
         table_format(output)
     if figure is not None:
-        check_output(figure, overwrite=True)
+        check_picture(figure, overwrite=True)
     sources = several(runs)
     rows, remarks = [], []
     for number, run in enumerate(sources, start=1):
@@ -65,8 +62,8 @@ def quality(
             nights = f"{rows[-1]['NIGHTS']} nights"
             remarks.append(f"{rows[-1]['RUN']}: holds {nights}, its row is that of the last")
     job.begin("writing")
-    new = table_of_nights(rows)
-    table, table_remarks = append(output, new, allowed)
+    table, table_remarks = append(output, table_of_nights(rows), allowed)
+    remarks += table_remarks
     if figure is not None:
         save_figure(figure, quality_figure(table, allowed), overwrite=True)
     hashes = {row["CALHASH"] for row in rows}
@@ -76,7 +73,6 @@ def quality(
         (f"{row['NIGHT']:.0f}", *(f"{row[name]:.4g}" for name in SHOWN), str(row[OUTSIDE])) for row in mine
     )
     title = f"{output or 'Quality numbers'}: {len(table)} night{'s' if len(table) != 1 else ''}"
-    remarks += table_remarks
     nights = [{name: row[name] for name in table.colnames} for row in mine]
     document = {"output": output, "nights": nights, "limits": {n: list(pair) for n, pair in allowed.items()}}
     document |= {"outside": out, "remarks": remarks}

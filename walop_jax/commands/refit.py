@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import shlex
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands import inputs
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, given, typed, write_text
+from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, goal_of, paths_of, set_and_model
 from walop_jax.commands.products import IN_MEMORY, Effects
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
+from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
+from walop_jax.io.progress import Stage, repeated
+from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet, FitResult
@@ -18,14 +20,14 @@ if TYPE_CHECKING:
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
-@command(stages=STAGES, writes=(), random=True)
+@command(stages=STAGES, writes=(PRODUCT, SUMMARY), random=True)
 def refit(
     job: Job,
-    data: inputs.Sets,
-    model: inputs.ModelLike = None,
+    data: Sets,
+    model: ModelLike = None,
     *,
     output: PathLike | None = None,
-    instrument: inputs.InstrumentLike = None,
+    instrument: InstrumentLike = None,
     effects: Effects = None,
     memory: float | None = 2.0,
     compress: PathLike | None = None,
@@ -64,55 +66,49 @@ def refit(
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
-    from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
-    from walop_jax.io.progress import Stage, repeated
-    from walop_jax.io.text import json_text
     from walop_jax.science.field_accuracy import answered
 
+    wanted = goal_of(goal) or GOAL
     if compress is not None:
         check_output(compress, overwrite=job.overwrite)
-    with job.reserved(output, (PRODUCT, SUMMARY)) as job:
-        job.begin("reading")
-        calset, chosen = inputs.set_and_model(data, model, instrument, effects, output=output)
-        with repeated(job.progress) as say:
-            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
-            say(Stage("looking for patterns in the residuals", "examining"))
-            result = answered(examined(fitted, job.seed), goal=inputs.goal_of(goal) or GOAL)
-        if compress is not None:
-            write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
-        is_written = output is not None
-        mapped = is_written and result.likelihood.layout.large and result.converged
-        residuals = residual_map(result) if mapped else None
-        misfit = describe(result) if is_written and not result.explains_data else None
-        shown = dataclasses.replace(result.display(), notes=result.notes)
-        brief = dataclasses.replace(shown, rows=(), notes=()).text()
-        judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
-        outcome = Outcome(
-            result,
-            summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
-            extra={"seed": job.seed},
-            display=shown,
-            text=None if result.trusted else f"{brief}\n{judged}",
-            below=judged,
-            files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
-            saved_as=SUMMARY,
-            next=next_steps(result.trusted, output, data, instrument=instrument, effects=effects),
-            warnings=result.warnings if misfit is None else misfit.reasons(result.warnings, output),
-            trusted=result.trusted,
-        )
-        if not result.converged:
-            failure = f"{output}: the fit did not converge ({result.minimum.message}); see {FAILED} there"
-            outcome = dataclasses.replace(outcome, text="", warnings=(), failure=failure)
-        if job.folder is None:
-            return outcome
+    job.begin("reading")
+    calset, chosen = set_and_model(data, model, instrument, effects, output=output)
+    with repeated(job.progress) as say:
+        fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
+        say(Stage("looking for patterns in the residuals", "examining"))
+        result = answered(examined(fitted, job.seed), goal=wanted)
+    if compress is not None and result.converged:
+        write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
+    mapped = output is not None and result.likelihood.layout.large and result.converged
+    residuals = residual_map(result) if mapped else None
+    misfit = describe(result) if output is not None and not result.explains_data else None
+    shown = dataclasses.replace(result.display(), notes=result.notes)
+    brief = dataclasses.replace(shown, rows=(), notes=()).text()
+    judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
+    options = {"instrument": instrument, "effects": effects, "elements": job.elements}
+    outcome = Outcome(
+        result,
+        summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
+        extra={"seed": job.seed},
+        display=shown,
+        text=None if result.trusted else f"{brief}\n{judged}",
+        below=judged,
+        files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
+        saved_as=SUMMARY,
+        drop=(FAILED,),
+        next=next_steps(result.trusted, output, data, **options),
+        warnings=result.warnings if misfit is None else misfit.reasons(result.warnings, output),
+        trusted=result.trusted,
+    )
+    if job.folder is not None:
         job.tell("mapping the field", "mapping")
-        if result.converged:
-            return outcome.save(job.folder, drop=(FAILED,))
-        job.folder.path.mkdir(exist_ok=True)
-        with atomic_path(job.folder.path / FAILED, overwrite=True) as temporary:
-            temporary.write_text(json_text(outcome.content), encoding="utf-8")
+    if result.converged:
         return outcome
+    if job.folder is not None:
+        job.folder.path.mkdir(exist_ok=True)
+        write_text(job.folder.path / FAILED, json_text(outcome.content), overwrite=True)
+    failure = f"{output}: the fit did not converge ({result.minimum.message}); see {FAILED} there"
+    return dataclasses.replace(outcome, text="", warnings=(), failure=failure, files={}, saved_as="")
 
 
 def _compressed(result: FitResult) -> CalibrationSet:
@@ -129,17 +125,12 @@ def _compressed(result: FitResult) -> CalibrationSet:
             "report counts as they are; tables and small frames are small enough as they are"
         )
         raise fail("cannot be compressed", file=where, advice=advice)
-    if not result.converged:
-        raise ValueError(f"the fit of the frames did not converge ({result.minimum.message})")
     return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
-def next_steps(trusted: bool, output: Any, data: inputs.Sets, **options: object) -> tuple[str, ...]:
+def next_steps(trusted: bool, output: Any, data: Sets, **options: object) -> tuple[str, ...]:
     """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
-    run, other = (shlex.quote(f"{output}{end}") for end in ("", "_diagnosis"))
-    if trusted:
-        return (f"walop-jax report {run}", f"walop-jax apply {run} STARS.fits -o OUT.fits")
-    sets = shlex.join(map(str, inputs.paths_of(data))) if output is not None else "CALSET"
-    given = {name: str(value) for name, value in options.items() if isinstance(value, str | Path)}
-    typed = "".join(f" --{name} {shlex.quote(value)}" for name, value in given.items())
-    return (f"walop-jax report {run}", f"walop-jax diagnose {sets}{typed} -o {other}")
+    report = typed("report", output)
+    if output is None or trusted:
+        return (report, typed("apply", output, "STARS.fits", "-o", "OUT.fits"))
+    return (report, typed("diagnose", *paths_of(data), *given(**options), "-o", f"{output}_diagnosis"))

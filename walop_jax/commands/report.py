@@ -6,15 +6,14 @@ import dataclasses
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, write_text
 from walop_jax.commands.inputs import goal_of, save
-from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
+from walop_jax.io.atomic import check_output
 from walop_jax.io.display import Display, Displayed
-
-if TYPE_CHECKING:
-    from walop_jax import FitResult, Run
+from walop_jax.io.text import encodable
 
 PAGE = "report.html"
 GENERATOR = '<meta name="generator" content="walop-jax'
@@ -40,7 +39,7 @@ class Page(Displayed):
 @command(stages=("reading", "drawing"), writes=())
 def report(
     job: Job,
-    run: FitResult | Diagnosed | Run | PathLike,
+    run: Fit,
     output: PathLike | None = None,
     *,
     data: Sequence[PathLike] | None = None,
@@ -63,11 +62,10 @@ def report(
     """
     from walop_jax import FitResult, Run
     from walop_jax.commands.diagnose import write
-    from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.text import encodable
     from walop_jax.reports.page import kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
+    wanted = goal_of(goal)
     with tempfile.TemporaryDirectory() as scratch:
         if isinstance(fit_of(run), FitResult):
             if output is None:
@@ -80,15 +78,16 @@ def report(
         target = folder / PAGE if output is None else Path(output)
         job.begin("reading")
         kind = kind_of_run(folder)
+        if kind != "fit" and (wanted is not None or data):
+            raise UsageError("this is for the page about a fit", "data" if wanted is None else "goal")
         contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
         overwrite = job.overwrite or _is_page(target)
         check_output(target, overwrite=overwrite)
         job.tell("drawing", "drawing")
-        page = render_other(folder, kind) if contents is None else render(contents, goal_of(goal))
+        page = render_other(folder, kind) if contents is None else render(contents, wanted)
     text, missing = encodable(page[0]), page[1]
-    with atomic_path(target, overwrite=overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return Outcome(Page(target, len(text.encode()), missing))
+    write_text(target, text, overwrite=overwrite)
+    return Outcome(Page(target, len(text.encode()), missing), next=("open the page in a browser",))
 
 
 def _is_page(path: Path) -> bool:

@@ -7,14 +7,16 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command
+from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import ModelLike
-from walop_jax.commands.products import Diagnosed, Effects, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
+from walop_jax.io.folder import output_folder
+from walop_jax.io.names import PRODUCT, SAMPLE
 from walop_jax.io.text import json_text, read_text
 
 if TYPE_CHECKING:
-    from walop_jax import FitResult, Options, Run
+    from walop_jax import Options, Run
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 CHAINS = "sampling"  # folder, in that of the run, of the chain that is kept
@@ -27,7 +29,7 @@ OUTPUTS = (
 @command(writes=(), random=True)
 def sample(
     job: Job,
-    fit: FitResult | Diagnosed | Run | PathLike,
+    fit: Fit,
     *,
     resume: bool = False,
     model: ModelLike = None,
@@ -81,8 +83,13 @@ def sample(
         where = folder_of(fit)  # pyright: ignore[reportArgumentType]
         run = Run(where, catalogue_of(effects), tuple(data or ()))
         posterior = _sampled_run(job, run, options, tell, model, resume)
-    failure, warnings = "" if posterior.sampled_well else f"{where}: {NOT_CONVERGED}", posterior.warnings
-    return Outcome(posterior, warnings=(*anew, *warnings), failure=failure, trusted=posterior.trusted)
+    return Outcome(
+        posterior,
+        warnings=(*anew, *posterior.warnings),
+        failure="" if posterior.sampled_well else f"{where}: {NOT_CONVERGED}",
+        trusted=posterior.trusted,
+        next=(typed("report", where),),
+    )
 
 
 def _sampled_run(
@@ -91,8 +98,6 @@ def _sampled_run(
     """The posterior around the fit in a folder, written there, with the covariance in its product if it can be."""
     from walop_jax import Model
     from walop_jax.calibration.product import read_calibration, write_calibration
-    from walop_jax.io.folder import output_folder
-    from walop_jax.io.names import PRODUCT
     from walop_jax.io.plain_tables import write_table
     from walop_jax.posterior.draws import digest_of
     from walop_jax.posterior.files import Chain, write_posterior
@@ -128,7 +133,7 @@ def _sampled_run(
                 write_table(temporary / f"posterior{end}", intervals)
             for name in ("corner", "trace"):
                 save_figure(temporary / f"posterior_{name}.png", draw(name, figures))
-            (temporary / "sample.json").write_text(json_text(document), encoding="utf-8")
+            (temporary / SAMPLE).write_text(json_text(document), encoding="utf-8")
             if posterior.trusted:
                 better = product.with_covariance(posterior.covariance, posterior.errors_from)
                 write_calibration(temporary / PRODUCT, better)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, given, typed, write_text
 from walop_jax.commands.inputs import InstrumentLike, design_of
-from walop_jax.commands.products import Diagnosed, Effects, calibration_of, catalogue_of, left_out_sentences
+from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, left_out_sentences
+from walop_jax.io.atomic import check_output
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, Effect, FitResult, ObservingPlan, Run
+    from walop_jax import Effect, ObservingPlan
     from walop_jax.model.effects import EffectKind
     from walop_jax.simulation.simulate import Simulated
     from walop_jax.simulation.truth import Template
@@ -29,7 +29,7 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: str | Sequence[str | Effect] | Mapping[str, Any] | None = None,
     effects: Effects = None,
-    like: Simulated | FitResult | Diagnosed | Calibration | Run | PathLike | None = None,
+    like: Simulated | Product | None = None,
     night: int | None = None,
     truth: PathLike | None = None,
     stars: int | None = None,
@@ -63,13 +63,12 @@ def simulate(
 
     from walop_jax import Instrument, ObservingPlan
     from walop_jax.data.write import write_calibration_set
-    from walop_jax.io.atomic import atomic_path, check_output
-    from walop_jax.io.plain_tables import astropy_table, write_table
+    from walop_jax.io.plain_tables import astropy_table, table_format, write_table
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.simulated_stars import simulated_stars
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
-    from walop_jax.simulation.simulate import Simulated, true_instrument
     from walop_jax.simulation.simulate import simulate as simulated
+    from walop_jax.simulation.simulate import true_instrument
     from walop_jax.simulation.truth import truth_document
 
     true = instrument if isinstance(instrument, Instrument) and plan is not None else None
@@ -91,67 +90,69 @@ def simulate(
             true, lost = template.instrument_of(plan, hidden)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    for path in (output, truth):
+    if cameras and (stars is None or output is None):
+        raise UsageError("catalogues of the cameras are those of --stars N, beside its --output", "cameras")
+    if stars is not None and "standard" not in plan.design.kinds:
+        raise UsageError(f"{plan.name} sees no stars", "stars")
+    beside = _beside(Path(str(output)), plan.design.cameras.names) if cameras else []
+    for path in (output, truth, *beside):
         if path is not None:
             check_output(path, overwrite=job.overwrite)
+    if stars is not None and output is not None:
+        table_format(output)
     drawn: dict[str, Any] = {"instrument": true, "effects": hidden, "catalogue_seed": catalogue_seed}
     drawn["catalogue"] = None if template is None else template.catalogue
     about: dict[str, Any] = {"output": output, "instrument": plan.name, "seed": job.seed, "truth": truth}
     about["effects"] = [hidden_effect.name for hidden_effect in hidden]
-    if cameras and (stars is None or output is None):
-        raise UsageError("catalogues of the cameras are those of --stars N, beside its --output", "cameras")
-    of_cameras: dict[Path, Any] = {}
     job.tell("following the light", "following")
     data: Any
     if stars is not None:
-        if "standard" not in plan.design.kinds:
-            raise UsageError(f"{plan.name} sees no stars", "stars")
         sources, true = true_instrument(plan, job.seed, **drawn)
         field = simulated_stars(plan, true, stars, job.seed, night=night or 0, noiseless=noiseless)
         data = astropy_table(field.columns, {"INSTRUME": plan.name})
-        content = truth_document(plan, job.seed, sources, true) | {"stars": field.document()}
+        tables = {path: astropy_table(*field.of_camera(k, job.seed)) for k, path in enumerate(beside)}
+        content, times = (
+            truth_document(plan, job.seed, sources, true) | {"stars": field.document()},
+            data["MJD"],
+        )
         about["stars"] = stars
         which = f"seed {job.seed}" if like is None or isinstance(like, tuple) else str(like)
         text = f"{output}: {plan.name}, {stars} stars of the instrument of {which}"
-        suggested, times = (f"walop-jax apply RUN {output} -o OUT.fits",), data["MJD"]
-        beside = Path(str(output))
-        end = ".fits.gz" if beside.name.lower().endswith(".fits.gz") else beside.suffix
-        for number, name in enumerate(plan.design.cameras.names if cameras else ()):
-            file_of_camera = beside.with_name(f"{beside.name[: len(beside.name) - len(end)]}_{name}{end}")
-            of_cameras[file_of_camera] = astropy_table(*field.of_camera(number, job.seed))
-        if of_cameras:
-            files = [str(path) for path in of_cameras]
-            about["cameras"], text = files, f"{text}; of the cameras: {', '.join(files)}"
-            suggested = (f"walop-jax gather {' '.join(files)} -o GATHERED.fits",)
+        step = typed("apply", "RUN", output, "-o", "OUT.fits")
+        if beside:
+            about["cameras"] = [str(path) for path in beside]
+            text += f"; of the cameras: {', '.join(about['cameras'])}"
+            step = typed("gather", *beside, "-o", "GATHERED.fits")
+        job.begin("writing")
+        for path, table in ({} if output is None else {output: data, **tables}).items():
+            write_table(path, table, overwrite=job.overwrite)
     else:
         data = simulated(plan, job.seed, noiseless=noiseless, night=night, **drawn)
         calset, true = data
-        content = truth_document(plan, job.seed, calset.sources, true)
+        content, times = truth_document(plan, job.seed, calset.sources, true), calset.exposures.mjd
         about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
         about["rows"] = calset.intensities.rows
         text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
-        fit = f"walop-jax refit {output} --instrument {file} -o RUN"
-        suggested = (fit,) if file is not None and plan.design.description else ()
-        times = calset.exposures.mjd
-    job.begin("writing")
-    with contextlib.ExitStack() as stack:
-        if truth is not None:
-            temporary = stack.enter_context(atomic_path(truth, overwrite=job.overwrite))
-            temporary.write_text(json_text(content), encoding="utf-8")
-        if output is not None and isinstance(data, Simulated):
-            write_calibration_set(output, data.calset, overwrite=job.overwrite)
-        elif output is not None:
-            for path in of_cameras:
-                check_output(path, overwrite=job.overwrite)
-            for path, table in {Path(output): data, **of_cameras}.items():
-                write_table(path, table, overwrite=job.overwrite)
+        options = given(instrument=file, elements=job.elements) if plan.design.description else ()
+        step = typed("refit", output, *options, "-o", "RUN")
+        job.begin("writing")
+        if output is not None:
+            write_calibration_set(output, calset, overwrite=job.overwrite)
+    if truth is not None:
+        write_text(truth, json_text(content), overwrite=job.overwrite)
     text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
         about |= {"like": None if isinstance(like, tuple) else str(like), "night": night, "mjd": mjd}
     warnings = left_out_sentences(lost, like if isinstance(like, str | os.PathLike) else None)
-    return Outcome(data, about, text, warnings=warnings, next=suggested)
+    return Outcome(data, about, text, warnings=warnings, next=(step,))
+
+
+def _beside(output: Path, names: Sequence[str]) -> list[Path]:
+    """The files of the catalogues of cameras, beside that of the stars: STARS_O1.fits, …"""
+    end = ".fits.gz" if output.name.lower().endswith(".fits.gz") else output.suffix
+    return [output.with_name(f"{output.name[: len(output.name) - len(end)]}_{name}{end}") for name in names]
 
 
 def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
@@ -167,30 +168,28 @@ def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
     return Template(held.model.instrument(held.values), held.sources)
 
 
-def _hidden(given: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
-    """The effects that a set holds. Raises ValueError for one that the instrument has no place for."""
+def _hidden(effect: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
+    """The effects that a set holds, also of a dict: {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}.
+
+    Raises ValueError for one that the instrument has no place for.
+    """
     from walop_jax.model.light_path import NoSuchPlaceError
     from walop_jax.simulation.simulate import effect_from_text
 
+    if isinstance(effect, Mapping):
+        pairs = {
+            name: ",".join(f"{k}:{v}" for k, v in size.items()) if isinstance(size, Mapping) else size
+            for name, size in effect.items()
+        }
+        effect = [f"{name}={size}" for name, size in pairs.items()]
     context, hidden = plan.context(), []
-    for entry in _texts(given):
+    for entry in [effect] if isinstance(effect, str) else effect or ():
         hidden.append(effect_from_text(entry, context, catalogue) if isinstance(entry, str) else entry)
         try:
             hidden[-1].patch(plan.design)
         except NoSuchPlaceError as error:
             raise ValueError(f"effect {hidden[-1].name!r}: {error}") from None
     return hidden
-
-
-def _texts(effect: str | Sequence[str | Effect] | Mapping[str, Any] | None) -> Sequence[str | Effect]:
-    """Effects as the command line writes them, of a dict: {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}."""
-    if not isinstance(effect, Mapping):
-        return (effect,) if isinstance(effect, str) else effect or ()
-    texts = []
-    for name, sizes in effect.items():
-        several = isinstance(sizes, Mapping)
-        texts.append(f"{name}={','.join(f'{k}:{v}' for k, v in sizes.items()) if several else sizes}")
-    return texts
 
 
 _LISTED = 12  # numbers of a parameter that are listed

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, UsageError, command, several
-from walop_jax.commands.products import Effects, OptionalProduct, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.command import Job, Outcome, UsageError, command, several, typed
+from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of
+from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -14,13 +15,13 @@ if TYPE_CHECKING:
     from walop_jax.nights.survey import Survey
 
 
-@command(stages=("reading", "stacking"), writes=())
+@command(stages=("reading", "stacking"), writes=(NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY))
 def stack(
     job: Job,
     nights: Any,
     laws: Any = None,
     *,
-    like: OptionalProduct = None,
+    like: Product | None = None,
     events: Any = None,
     no_breaks: bool = False,
     workers: int | None = None,
@@ -50,13 +51,13 @@ def stack(
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
     from walop_jax.nights.making import executor_of
-    from walop_jax.nights.stacking import FILES, PARTIAL, writers
+    from walop_jax.nights.stacking import PARTIAL, writers
     from walop_jax.nights.stacking import stack as stacked
 
     if workers is not None and scheduler is not None:
         raise UsageError("workers and scheduler exclude each other: a cluster has workers", "scheduler")
     sources = [fit_of(night) for night in several(nights)]
-    with job.reserved(output, FILES) as job, executor_of(workers, scheduler) as executor:
+    with executor_of(workers, scheduler) as executor:
         job.begin("reading")
         survey = stacked(
             sources,
@@ -69,8 +70,15 @@ def stack(
             tell=lambda text: job.tell(text, "stacking"),
             catalogue=catalogue_of(effects),
         )
-        stars = (f"walop-jax apply {output} STARS.fits -o OUT.fits",) if survey.trusted else ()
-        judged = {"warnings": survey.verdict.warnings, "trusted": survey.trusted}
-        steps = (f"walop-jax report {output}", *stars)
-        outcome = Outcome(survey, files=writers(survey), saved_as=FILES[-1], next=steps, **judged)
-        return outcome if job.folder is None else outcome.save(job.folder, drop=(PARTIAL,))
+    return Outcome(
+        survey,
+        files=writers(survey),
+        saved_as=SURVEY,
+        drop=(PARTIAL,),
+        warnings=survey.verdict.warnings,
+        trusted=survey.trusted,
+        next=(
+            typed("report", output),
+            *[typed("apply", output, "STARS.fits", "-o", "OUT.fits")] * survey.trusted,
+        ),
+    )

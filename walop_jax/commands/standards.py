@@ -45,17 +45,22 @@ def standards(
         table["DISTANCE"] = away * table["RA"].unit
         nearest = np.argsort(away, kind="stable")
         table, ra, dec = table[nearest], ra[nearest], dec[nearest]
+    if up is None and instrument is not None:
+        raise UsageError("its site matters for stars that are up alone; see --up", "instrument")
     if up is not None:
         if up != up:
             raise UsageError("up = nan must be a time (MJD)", "up")
         check({"MJD": np.array([up])}, {"MJD": EXPOSURES["MJD"]}, Place("up", ""))
         described: Any = default_name() if instrument is None else instrument
         place: Any = described.site if hasattr(described, "site") else read_description(described).place
-        height = altitude(np.full(len(ra), up), ra, dec, Site(*place[:4]))
+        if not (site := Site(*place[:4])).known:
+            raise UsageError("the site of this instrument is not known", "instrument")
+        height = altitude(np.full(len(ra), up), ra, dec, site)
         order = np.arange(len(ra)) if near is not None else np.argsort(-height, kind="stable")
         table["ALTITUDE"] = height * table["RA"].unit
         table = table[order[height[order] >= LOWEST]]
-    rows = [{name: _plain(row[name]) for name in table.colnames} for row in table]
+    columns = {name: getattr(table[name], "value", table[name]).tolist() for name in table.colnames}
+    rows = [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
     return Outcome(table, {**table.meta, "standards": rows}, _lines(table))
 
 
@@ -63,21 +68,13 @@ def _direction(near: str | tuple[float, float]) -> tuple[float, float]:
     try:
         ra, dec = (float(coordinate) for coordinate in (near.split(",") if isinstance(near, str) else near))
     except ValueError:
-        raise UsageError(
-            f"near = {near!r} must be right ascension and declination in degrees: 308.2,41.2"
-        ) from None
+        wanted = "right ascension and declination in degrees: 308.2,41.2"
+        raise UsageError(f"near = {near!r} must be {wanted}", "near") from None
     if not -90.0 <= dec <= 90.0:
-        raise UsageError(f"near = {near!r}: a declination is between -90 and 90 degrees")
+        raise UsageError(f"near = {near!r}: a declination is between -90 and 90 degrees", "near")
     if not -360.0 <= ra <= 360.0:
-        raise UsageError(f"near = {near!r}: a right ascension is between 0 and 360 degrees")
+        raise UsageError(f"near = {near!r}: a right ascension is between 0 and 360 degrees", "near")
     return ra, dec
-
-
-def _plain(value: Any) -> Any:
-    """A cell as JSON has it; unknown values are null."""
-    plain = getattr(value, "value", value)
-    plain = plain.item() if hasattr(plain, "item") else plain
-    return None if plain != plain else plain
 
 
 def _lines(table: Any) -> str:

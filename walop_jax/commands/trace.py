@@ -6,27 +6,28 @@ import math
 from typing import TYPE_CHECKING
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Outcome, UsageError, command
 from walop_jax.commands.inputs import InstrumentLike, design_of
+from walop_jax.commands.products import Angles, Effects, Product
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Instrument, Run
+    from walop_jax import Instrument
     from walop_jax.model.trace import Traced
 
 
 @command()
 def trace(
     job: Job,
-    calibration: Calibration | FitResult | products.Diagnosed | Run | Instrument | PathLike | None = None,
+    calibration: Product | Instrument | None = None,
     *,
     instrument: InstrumentLike = None,
-    effects: products.Effects = None,
+    effects: Effects = None,
     x: float = 0.0,
     y: float = 0.0,
     q: float = 0.0,
     u: float = 0.0,
     angle: float | None = None,
-    at: products.Angles = None,
+    at: Angles = None,
     teff: float | None = None,
     filter: str = "SDSS-r",
 ) -> Outcome[Traced]:
@@ -48,6 +49,10 @@ def trace(
 
     if isinstance(calibration, Instrument):
         calibration, instrument = None, calibration
+    elif calibration is not None and instrument is not None:
+        raise UsageError(
+            "light is followed through one of them: the calibration or an instrument", "instrument"
+        )
     try:
         setting = Settings.default(1, filter).at(**products.angles_of(at))
         setting.teff[0] = math.nan if teff is None else teff

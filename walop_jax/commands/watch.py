@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file
+from walop_jax.commands.apply import stars_of
+from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.commands.tables import named_tables
+from walop_jax.io.errors import errors_naming
+from walop_jax.io.names import WATCHED
 
 if TYPE_CHECKING:
     from walop_jax.science.watch import Watch
 
-OUTPUTS = ("watch.json", "watch.fits", "watch.png")
+TABLE, FIGURE = "watch.fits", "watch.png"
 
 
-@command(stages=("reading", "tabulating", "watching"), writes=OUTPUTS)
+@command(stages=("reading", "tabulating", "watching"), writes=(WATCHED, TABLE, FIGURE))
 def watch(
     job: Job,
     calibration: Product,
@@ -38,26 +41,26 @@ def watch(
 
     >>> walop.watch("RUN", ["night1.fits", "night2.fits"])  # doctest: +SKIP
     """
-    from walop_jax.io.errors import errors_naming
     from walop_jax.reports.survey_figures import watch_figure
-    from walop_jax.science.catalogue import read_catalogue
     from walop_jax.science.watch import watch as watched
 
     job.begin("reading")
     held = calibration_of(calibration, effects)
     names, tables = zip(*named_tables(catalogues), strict=True)
-    instrument, always_in = held.model.template.patched(), held.always_in
-    rows = [read_catalogue(table, instrument, always_in=always_in) for table in tables]
+    rows = [stars_of(table, held) for table in tables]
     job.tell("tabulating the analysis vectors", "tabulating")
     with errors_naming(", ".join(names)):
         history = watched(held, rows, names=names, force=force)
     table = history.to_table()
-    writers = (lambda path: table.write(path, format="fits"), figure_file(watch_figure, history))
     return Outcome(
         history,
         extra={"product": held.content_hash()},
-        files=dict(zip(OUTPUTS[1:], writers, strict=True)),
-        saved_as=OUTPUTS[0],
+        files={
+            TABLE: lambda path: table.write(path, format="fits"),
+            FIGURE: figure_file(watch_figure, history),
+        },
+        saved_as=WATCHED,
         warnings=held.warnings,
         trusted=history.holds,
+        next=(typed("report", output),),
     )

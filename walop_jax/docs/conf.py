@@ -17,7 +17,6 @@ from sphinx.util.docutils import SphinxDirective
 
 import walop_jax
 from walop_jax.commands import COMMANDS
-from walop_jax.commands.command import Argument
 
 project, author, release = "walop-jax", "The walop-jax developers", walop_jax.__version__
 extensions = ["myst_parser", "sphinx.ext.mathjax"]
@@ -40,10 +39,10 @@ class Commands(SphinxDirective):
         parts = []
         for name in COMMANDS:
             command = getattr(walop_jax, name.replace("-", "_")).command
-            words = [o.metavar or k for k, o in command.options.items() if isinstance(o, Argument)]
+            words = [o.metavar or k for k, o in command.options.items() if o.placed]
             parts += [f"## {name}", f"    walop-jax {name} {' '.join(words)}".rstrip()]
             parts.append(inspect.cleandoc(command.body.__doc__ or ""))
-            options = {k: o for k, o in command.options.items() if not isinstance(o, Argument)}
+            options = {k: o for k, o in command.options.items() if not o.placed}
             options |= {"overwrite": command.described["overwrite"]} if command.writes is not None else {}
             if options:
                 rows = [f"| `--{k.replace('_', '-')}` | {o.help} |" for k, o in options.items()]

@@ -54,7 +54,6 @@ LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
-FILES = (NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY)  # the files of a survey
 PARTIAL = "partial"  # folder of the nights that are made, until all are
 
 
