@@ -184,7 +184,7 @@ ERRORS = (
             "plans/test_optimal.py"),
     planted("plans/families.py", "bend += (0.5 if", "bend += (0.0 if", "plans/test_optimal.py"),
     # commands
-    planted("commands/refit.py", "        if result.converged:\n", "        if True:\n",
+    planted("commands/refit.py", "    if result.converged:\n", "    if True:\n",
             "commands/test_refit_run.py"),
 )  # fmt: skip
 
