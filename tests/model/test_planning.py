@@ -16,7 +16,7 @@ from walop_jax.model.effects.base import Scalar
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import number, param
-from walop_jax.model.planning import SMOOTH_NODES, plan_for, shares_of_points
+from walop_jax.model.planning import SMOOTH_NODES, nodes_for, plan_for, shares_of_points
 
 CURVE = {"band": builders.curve([0.59, 0.62, 0.65], [1.0, 1.0, 1.0])}
 DEVICE = nominal_instrument()
@@ -24,7 +24,7 @@ X, Y = jnp.asarray(0.21), jnp.asarray(-0.17)
 RNG = np.random.default_rng(3)
 ROWS = [
     {"kind": "moon", "mjd": 61044.0 + hour / 24.0, "temp": temp, "ha": hour - 3.0}
-    for hour, temp in zip(np.sort(RNG.uniform(0.0, 8.0, 25)), RNG.uniform(-5.0, 15.0, 25), strict=True)
+    for hour, temp in zip(np.sort(RNG.uniform(0.0, 8.0, 25)), RNG.uniform(8.5, 11.5, 25), strict=True)
 ]
 
 
@@ -71,19 +71,19 @@ def test_every_exposure_is_as_if_it_were_alone(texts, count):
 
 
 class StepGlass(Element):
-    """A window that jumps at 5 °C, of its own kind."""
+    """A window that jumps at 10 °C, of its own kind."""
 
-    rate: Scalar = number(unit="rad", about="retardance above 5 °C")
+    rate: Scalar = number(unit="rad", about="retardance above 10 °C")
 
     def mueller(self, ray):
-        return mueller.retarder(self.rate * (ray.conditions.temperature > 5.0), jnp.deg2rad(30.0))
+        return mueller.retarder(self.rate * (ray.conditions.temperature > 10.0), jnp.deg2rad(30.0))
 
 
 class Jump(Effect):
     """Its window behind the collimator."""
 
     rate: Scalar = param(
-        unit="rad", about="retardance above 5 °C", source="this test", width=0.1, default=0.0
+        unit="rad", about="retardance above 10 °C", source="this test", width=0.1, default=0.0
     )
     name: ClassVar[str] = "jump"
 
@@ -95,7 +95,7 @@ def test_an_element_that_asks_for_a_condition_itself_gets_every_value():
     device = dataclasses.replace(DEVICE, effects=(Jump(rate=jnp.asarray(0.3)),))
     assert solved(device) == len(ROWS)
     together = rows_of(device, ROWS)
-    warm = np.array([row["temp"] > 5.0 for row in ROWS])
+    warm = np.array([row["temp"] > 10.0 for row in ROWS])
     np.testing.assert_allclose(
         together[warm], np.broadcast_to(together[warm][:1], together[warm].shape), atol=1e-14
     )
@@ -106,7 +106,7 @@ def test_shares_are_those_of_polynomials():
     """Any polynomial of seventh degree in one condition, times any function of three values of another, is exact."""
     hours = RNG.uniform(-3.0, 9.0, 100)
     moments = [(float(t), float(k)) for t in hours for k in (1.0, 2.0, 5.0)]
-    shares = shares_of_points(moments)
+    shares = shares_of_points(moments, [SMOOTH_NODES, SMOOTH_NODES])
     assert len(set().union(*shares.values())) == 3 * SMOOTH_NODES
     coefficients = RNG.standard_normal(SMOOTH_NODES)
     for (t, k), of_points in list(shares.items())[::17]:
@@ -120,10 +120,40 @@ def test_shares_are_those_of_polynomials():
 
 @pytest.mark.parametrize("moments", [[()], [(1.0,), (4.0,)], [(float(t),) for t in range(SMOOTH_NODES)]])
 def test_few_moments_are_followed_one_by_one(moments):
-    assert shares_of_points(moments) == {moment: {moment: 1.0} for moment in moments}
+    alone = {moment: {moment: 1.0} for moment in moments}
+    assert shares_of_points(moments, [SMOOTH_NODES] * len(moments[0])) == alone
 
 
 def test_a_moment_without_a_value_leaves_the_others_as_they_are():
     """A missing TEMP is no reason for interpolation with what is not a number."""
     moments = [(float(t),) for t in range(20)] + [(np.nan,)]
-    assert all(len(of_points) == 1 for of_points in shares_of_points(moments).values())
+    assert all(len(of_points) == 1 for of_points in shares_of_points(moments, [SMOOTH_NODES]).values())
+
+
+@pytest.mark.parametrize("swing", [0.05, 0.4, 3.0, 40.0])
+def test_a_phase_that_changes_by_much_has_more_values(swing):
+    """The factor exp(i a t) at 500 values of t in (−1, 1), from those at the points."""
+    moments = [(float(t),) for t in np.linspace(-1.0, 1.0, 500)]
+    shares = shares_of_points(moments, [nodes_for(swing)])
+    error = [
+        abs(
+            sum(part * np.exp(1j * swing * t) for (t,), part in shares[moment].items())
+            - np.exp(1j * swing * moment[0])
+        )
+        for moment in moments
+    ]
+    assert max(error) < 1e-9
+    assert (nodes_for(swing) == SMOOTH_NODES) == (swing < 0.3)
+
+
+def test_thick_plates_of_another_temperature_are_followed():
+    """Quartz of 30 mm has 430 waves, which change by 0.05 waves per kelvin."""
+    thick = DEVICE.changed(
+        "half1.plate", layers=lambda layers: (dataclasses.replace(layers[0], thickness=jnp.asarray(3e4)),)
+    )
+    warmer = Described.saying(["thermal of half1.plate"], np.array([1.0]))
+    device = dataclasses.replace(thick, effects=(warmer,))
+    rows = [row | {"temp": temp} for row, temp in zip(ROWS, np.linspace(-20.0, 20.0, 25), strict=True)]
+    together = rows_of(device, rows)
+    alone = rows_of(device, [rows[0], rows[9]])
+    np.testing.assert_allclose(together[9], alone[1], rtol=0.0, atol=1e-9)

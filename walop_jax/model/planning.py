@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy import special
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Exposures, FilterCurve, Sources
@@ -19,15 +20,17 @@ from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.materials import EXTRAPOLATED, MATERIALS
+from walop_jax.model.materials import CRYSTALS, EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures
 from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
 from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions
 from walop_jax.model.sources import ExposureArrays
 
 SMOOTH_NODES = 8
-"""Values of a condition at which the optics are solved where they depend on it smoothly: exact for a polynomial of
-seventh degree, and to 2(a/2)⁸/8! for a phase that changes by ±a rad, 10⁻¹⁰ for a = 0.4."""
+"""Values of a condition at which the optics are solved where they depend on it smoothly, at least: exact for a
+polynomial of seventh degree, and to 2(a/2)⁸/8! for a phase that changes by ±a rad, 10⁻¹⁰ for a = 0.4."""
+INTERPOLATED = 1e-10
+"""Largest error of a phase factor between these values: thick plates have more of them in temperature."""
 SAMPLES = 9  # wavelengths of a band with a monotonic retardance between them
 ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the nodes allow
 
@@ -255,7 +258,7 @@ def _plan(
     assert set(values) == set(CONDITIONS)
     values |= {f"kind {kind}": (kinds == kind) * 1.0 for kind in instrument.kinds}
     for name in names:
-        if name not in values:
+        if name.startswith("hours "):  # an interval, `Conditions.between`
             _, start, _, stop = name.split()
             values[name] = ((values["hours"] >= float(start)) & (values["hours"] < float(stop))) * 1.0
     # A band is (positions, filter, conditions, smooth ones, colour temperature, slope, KIND); sorting puts equal
@@ -275,7 +278,12 @@ def _plan(
     moments: dict[Case, set[Moment]] = {}
     for _, name, at, followed_at, *_ in bands:
         moments.setdefault((name, at), set()).add(followed_at)
-    shares = {case: shares_of_points(of_case) for case, of_case in sorted(moments.items())}
+    widths = np.ptp([values[name] for name in smooth], axis=1).tolist() if smooth else []
+    swings = [
+        0.5 * width * _phase_slope(patched, name, filters) for name, width in zip(smooth, widths, strict=True)
+    ]
+    most = [nodes_for(swing) for swing in swings]
+    shares = {case: shares_of_points(of_case, most) for case, of_case in sorted(moments.items())}
     groups = [
         (*case, at) for case, of_case in shares.items() for at in sorted(set().union(*of_case.values()))
     ]
@@ -339,14 +347,14 @@ Case = tuple[str, Moment]
 """A filter, and values of the conditions that are followed one by one."""
 
 
-def shares_of_points(moments: Collection[Moment]) -> dict[Moment, dict[Moment, float]]:
+def shares_of_points(moments: Collection[Moment], most: Sequence[int]) -> dict[Moment, dict[Moment, float]]:
     """Points at which the optics are solved for some moments, and the share of each point in each moment.
 
-    Lagrange's interpolation on a grid with `SMOOTH_NODES` of Chebyshev's points along a condition of more values; the
+    Lagrange's interpolation on a grid with so many of Chebyshev's points along a condition of more values; the
     moments themselves where a grid has no fewer points. Source: Trefethen 2013, Approximation Theory, chs. 5, 8.
     """
     at = np.array(sorted(moments))
-    axes = [_points_along(values) for values in at.T]
+    axes = [_points_along(values, count) for values, count in zip(at.T, most, strict=True)]
     if not np.isfinite(at).all() or np.prod([len(axis) for axis in axes]) >= len(at):
         return {moment: {moment: 1.0} for moment in moments}
     share = np.ones((len(at), 1))
@@ -361,12 +369,40 @@ def shares_of_points(moments: Collection[Moment]) -> dict[Moment, dict[Moment, f
     }
 
 
-def _points_along(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
+def _points_along(values: Float[np.ndarray, " n"], most: int) -> Float[np.ndarray, " k"]:
     points = np.unique(values)
-    if len(points) <= SMOOTH_NODES:
+    if len(points) <= most:
         return points
     low, high = points[0], points[-1]
-    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(np.pi * np.linspace(0.0, 1.0, SMOOTH_NODES))
+    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(np.pi * np.linspace(0.0, 1.0, most))
+
+
+def nodes_for(swing: float) -> int:
+    """Number of values of a condition that serve for a phase that changes by ±`swing` (rad), NaN as 0."""
+    count = SMOOTH_NODES
+    while count * np.log(max(swing, 1e-9) / 2.0) + np.log(2.0) - special.gammaln(count + 1.0) > np.log(
+        INTERPOLATED
+    ):
+        count += 1
+    return count
+
+
+def _phase_slope(instrument: Instrument, name: str, filters: Mapping[str, FilterCurve]) -> float:
+    """Largest change of a retardance (rad) of an instrument (patched) with a condition, in its unit.
+
+    Of temperature that of all layers of the thickest plate, at twice the published change; others are small.
+    """
+    if name != "temperature":
+        return 0.0
+    slopes, shortest = [0.0], min(float(curve.wavelength.min()) for curve in filters.values())
+    trains = [instrument.train(), *(arm.train() for arm in instrument.arms)]
+    for element in itertools.chain.from_iterable(trains):
+        if waves := element.retardances(np.array([shortest])):
+            thermal = max(
+                (abs(c.thermal) for n, c in CRYSTALS.items() if n in element.materials), default=0.0
+            )
+            slopes.append(2.0 * 2.0 * np.pi * float(waves[1][0]) * thermal)
+    return max(slopes)
 
 
 def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:
