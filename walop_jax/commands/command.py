@@ -180,8 +180,7 @@ class Outcome(Generic[T]):
     the output folder, or write them, each given its path; the document is written as the file `saved_as`, with the
     display; the files `drop` go then. `warnings` are sentences to bear in mind. `failure` is the error (exit code 1),
     `trusted` whether the result can be used (exit code 3 if not). `next` are command lines that one might want to type
-    next (`typed`; empty ones are left out).
-    `markdown`: the text is laid out on a terminal.
+    next (`typed`; empty ones are left out). `markdown`: the text is laid out on a terminal.
     """
 
     value: T
@@ -257,8 +256,7 @@ class Command(Generic[T]):
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" or "table" if `output` is a single one; () if the body looks after its outputs itself. `random`: its seed
-    matters.
-    `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do anyway.
+    matters. `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do.
     `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
     share. `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
     """

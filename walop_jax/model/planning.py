@@ -16,6 +16,7 @@ from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Exposures, FilterCurve, Sources
 from walop_jax.data.settings import Settings, nearest_hours
 from walop_jax.io.errors import fail
+from walop_jax.model import chebyshev
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.fold import Turning
@@ -23,7 +24,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures
 from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
-from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions
+from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions, within
 from walop_jax.model.sources import ExposureArrays
 
 SMOOTH_NODES = 8
@@ -260,7 +261,7 @@ def _plan(
     for name in names:
         if name.startswith("hours "):  # an interval, `Conditions.between`
             _, start, _, stop = name.split()
-            values[name] = ((values["hours"] >= float(start)) & (values["hours"] < float(stop))) * 1.0
+            values[name] = within(values["hours"], start, stop) * 1.0
     # A band is (positions, filter, conditions, smooth ones, colour temperature, slope, KIND); sorting puts equal
     # positions together. NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so
     # that a set with another colour for one of them has a plan of the same shape, and the same programs.
@@ -275,25 +276,10 @@ def _plan(
     keys = list(zip(states, of_filter, planned, followed, teff, slope.tolist(), kinds.tolist(), strict=True))
     bands = sorted(set(keys))
 
-    moments: dict[Case, set[Moment]] = {}
-    for _, name, at, followed_at, *_ in bands:
-        moments.setdefault((name, at), set()).add(followed_at)
-    widths = np.ptp([values[name] for name in smooth], axis=1).tolist() if smooth else []
-    swings = [
-        0.5 * width * _phase_slope(patched, name, filters) for name, width in zip(smooth, widths, strict=True)
-    ]
-    most = [nodes_for(swing) for swing in swings]
-    shares = {case: shares_of_points(of_case, most) for case, of_case in sorted(moments.items())}
-    groups = [
-        (*case, at) for case, of_case in shares.items() for at in sorted(set().union(*of_case.values()))
-    ]
-    number = {group: i for i, group in enumerate(groups)}
-    share = np.zeros((len(bands), len(groups)))
-    for row, (_, name, at, followed_at, *_) in zip(share, bands, strict=True):
-        for point, part in shares[name, at][followed_at].items():
-            row[number[name, at, point]] = part
-    curves = {name: filters[name] for name, *_ in groups}
+    curves = {name: filters[name] for name in sorted({name for _, name, *_ in bands})}
     extrapolations(patched, curves.values())
+    swings = [0.5 * np.ptp(values[name]) * _phase_slope(patched, name, curves.values()) for name in smooth]
+    groups, share = _points([band[1:4] for band in bands], [nodes_for(float(swing)) for swing in swings])
     rules = {
         name: _rule(
             tuple(c.wavelength.tolist()),
@@ -343,61 +329,77 @@ def _plan(
 
 Moment = tuple[float, ...]
 """Values of some conditions."""
-Case = tuple[str, Moment]
-"""A filter, and values of the conditions that are followed one by one."""
+
+
+def _points(
+    bands: Sequence[tuple[str, Moment, Moment]], most: Sequence[int]
+) -> tuple[list[tuple[str, Moment, Moment]], Float[np.ndarray, "b g"]]:
+    """Points at which the optics are solved, and the share of each in each band.
+
+    Both are a filter, conditions that are followed one by one, and smooth ones with `most` nodes.
+    """
+    together: dict[tuple[str, Moment], set[Moment]] = {}
+    for name, at, followed in bands:
+        together.setdefault((name, at), set()).add(followed)
+    shares = {case: shares_of_points(moments, most) for case, moments in sorted(together.items())}
+    points = [(*case, at) for case, of in shares.items() for at in sorted(set().union(*of.values()))]
+    number = {point: i for i, point in enumerate(points)}
+    share = np.zeros((len(bands), len(points)))
+    for row, (name, at, followed) in zip(share, bands, strict=True):
+        for point, part in shares[name, at][followed].items():
+            row[number[name, at, point]] = part
+    return points, share
 
 
 def shares_of_points(moments: Collection[Moment], most: Sequence[int]) -> dict[Moment, dict[Moment, float]]:
     """Points at which the optics are solved for some moments, and the share of each point in each moment.
 
-    Lagrange's interpolation on a grid with so many of Chebyshev's points along a condition of more values; the
-    moments themselves where a grid has no fewer points. Source: Trefethen 2013, Approximation Theory, chs. 5, 8.
+    Lagrange's interpolation on a grid with at most so many nodes along each condition; the moments themselves where a
+    grid has no fewer points. Source: Trefethen 2013, Approximation Theory, chs. 5, 8.
     """
     at = np.array(sorted(moments))
-    axes = [_points_along(values, count) for values, count in zip(at.T, most, strict=True)]
-    if not np.isfinite(at).all() or np.prod([len(axis) for axis in axes]) >= len(at):
+    every = [_along(values, count) for values, count in zip(at.T, most, strict=True)]
+    if not np.isfinite(at).all() or np.prod([len(points) for points, _ in every]) >= len(at):
         return {moment: {moment: 1.0} for moment in moments}
     share = np.ones((len(at), 1))
-    for axis, values in zip(axes, at.T, strict=True):
-        away = (values[:, None] - axis)[:, None, :] / (axis[:, None] - axis + np.eye(len(axis)))
-        lagrange = np.where(np.eye(len(axis), dtype=bool), 1.0, away).prod(axis=2)
+    for _, lagrange in every:
         share = (share[:, :, None] * lagrange[:, None, :]).reshape(len(at), -1)
-    grid = list(itertools.product(*(axis.tolist() for axis in axes)))
-    return {
-        tuple(moment): dict(zip(grid, row, strict=True))
-        for moment, row in zip(at.tolist(), share.tolist(), strict=True)
-    }
+    grid = list(itertools.product(*(points.tolist() for points, _ in every)))
+    rows = zip(at.tolist(), share.tolist(), strict=True)
+    return {tuple(moment): dict(zip(grid, row, strict=True)) for moment, row in rows}
 
 
-def _points_along(values: Float[np.ndarray, " n"], most: int) -> Float[np.ndarray, " k"]:
-    points = np.unique(values)
+def _along(
+    values: Float[np.ndarray, " n"], most: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
+    """Nodes along a condition and their Lagrange polynomials at its values: these themselves, if there are few."""
+    points, place = np.unique(values, return_inverse=True)
     if len(points) <= most:
-        return points
-    low, high = points[0], points[-1]
-    return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(np.pi * np.linspace(0.0, 1.0, most))
+        return points, np.eye(len(points))[place]
+    middle, half = 0.5 * (points[0] + points[-1]), 0.5 * (points[-1] - points[0])
+    lagrange = chebyshev.polynomials((values - middle) / half, most) @ chebyshev.to_coefficients(most)
+    return middle + half * chebyshev.nodes(most), lagrange
 
 
 def nodes_for(swing: float) -> int:
     """Number of values of a condition that serve for a phase that changes by ±`swing` (rad), NaN as 0."""
-    count = SMOOTH_NODES
-    while count * np.log(max(swing, 1e-9) / 2.0) + np.log(2.0) - special.gammaln(count + 1.0) > np.log(
-        INTERPOLATED
-    ):
+    count, half, least = SMOOTH_NODES, max(swing, 1e-9) / 2.0, np.log(INTERPOLATED / 2.0)
+    while count * np.log(half) - special.gammaln(count + 1.0) > least:
         count += 1
     return count
 
 
-def _phase_slope(instrument: Instrument, name: str, filters: Mapping[str, FilterCurve]) -> float:
+def _phase_slope(instrument: Instrument, name: str, curves: Iterable[FilterCurve]) -> float:
     """Largest change of a retardance (rad) of an instrument (patched) with a condition, in its unit.
 
     Of temperature that of all layers of the thickest plate, at twice the published change; others are small.
     """
-    if name != "temperature":
+    bright = np.concatenate([curve.wavelength[curve.throughput > 0] for curve in curves])
+    if name != "temperature" or not bright.size:
         return 0.0
-    slopes, shortest = [0.0], min(float(curve.wavelength.min()) for curve in filters.values())
-    trains = [instrument.train(), *(arm.train() for arm in instrument.arms)]
-    for element in itertools.chain.from_iterable(trains):
-        if waves := element.retardances(np.array([shortest])):
+    slopes = [0.0]
+    for element in instrument.ahead_of_analysers():
+        if waves := element.retardances(bright[[bright.argmin()]]):
             thermal = max(
                 (abs(c.thermal) for n, c in CRYSTALS.items() if n in element.materials), default=0.0
             )

@@ -7,6 +7,7 @@ Units       field coordinates deg; direction cosines of the unit vector along th
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +21,11 @@ and their columns of EXPOSURES. Whether an exposure is of some KIND is one more,
 some interval of hours."""
 SMOOTH = "smooth "
 """Opens the name of a condition of which the optics are needed at a few values only (`planning.SMOOTH_NODES`)."""
+
+
+def within(hours: Any, start: str, stop: str) -> Any:
+    """True for hours of an interval, which is given as it is typed; the end is outside."""
+    return (hours >= float(start)) & (hours < float(stop))
 
 
 class NotPlannedError(ValueError):

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.kinds import KINDS, ExposureKind
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.parameters import Component, Scalar, number, param
-from walop_jax.model.ray import NotPlannedError
+from walop_jax.model.ray import NotPlannedError, within
 
 PAPER_II = "Maharana et al. 2022, Paper II"
 COLOUR_OF_STANDARDS = "Serkowski, Mathewson & Ford 1975, ApJ 196, 261; Whittet et al. 1992, ApJ 386, 562"
@@ -78,7 +78,7 @@ class ExposureArrays(eqx.Module):
 
     def between(self, start: str, stop: str) -> Bool[Array | np.ndarray, " e"]:
         """True in exposures of an interval of hours after the first one."""
-        return (self.hours >= float(start)) & (self.hours < float(stop))
+        return within(self.hours, start, stop)
 
     def of_kind(self, name: str) -> Bool[Array | np.ndarray, " e"]:
         """True in exposures of a KIND."""

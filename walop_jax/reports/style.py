@@ -164,9 +164,7 @@ class Canvas:
             rest = place.get_gridspec()[place.rowspan.start, place.colspan.start :]
             axes[0, columns - 1].set_subplotspec(rest)
         axes = axes[:, :columns]
-        for (
-            axis
-        ) in axes.ravel():  # here, since the settings at the time of drawing may be those of the caller
+        for axis in axes.ravel():  # now: when it is drawn, the settings may be those of the caller
             axis.tick_params(labelsize=SMALL)
         return figure, axes.T if turned else axes
 
