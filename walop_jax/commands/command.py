@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.io.atomic import atomic_path, check_output
-from walop_jax.io.errors import PathLike, fail, nearest
+from walop_jax.io.errors import PathLike, nearest
 from walop_jax.io.folder import NotWrittenError, OutputFolder, output_folder
 from walop_jax.io.progress import Stage
 from walop_jax.io.text import json_text
@@ -154,16 +154,6 @@ def typed(*words: object) -> str:
 def given(**options: object) -> list[object]:
     """The words by which options are given; those that are None are left out."""
     return [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
-
-
-PICTURES = (".pdf", ".png", ".svg", ".eps", ".jpg")
-
-
-def check_picture(path: PathLike, *, overwrite: bool) -> None:
-    """Refuse the name of a picture that cannot be written, as `check_output` does, and for its extension."""
-    if Path(path).suffix.lower() not in PICTURES:
-        raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(PICTURES)}")
-    check_output(path, overwrite=overwrite)
 
 
 def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object]:

@@ -7,12 +7,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, check_picture, command
+from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, catalogue_of
+from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
 
 if TYPE_CHECKING:
     from walop_jax.reports.run import Drawable
+
+
+PICTURES = (".pdf", ".png", ".svg", ".eps", ".jpg")
+
+
+def check_picture(path: PathLike, *, overwrite: bool) -> None:
+    """Refuse the name of a picture that cannot be written, as `check_output` does, and for its extension."""
+    if Path(path).suffix.lower() not in PICTURES:
+        raise fail("is no picture that can be written", file=path, advice=f"use {', '.join(PICTURES)}")
+    check_output(path, overwrite=overwrite)
 
 
 @command(writes=())

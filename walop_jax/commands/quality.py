@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, check_picture, command, several
+from walop_jax.commands.command import Job, Outcome, PathLike, command, several
+from walop_jax.commands.plot import check_picture
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.io.atomic import check_output
 from walop_jax.io.display import Display

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Set
 from typing import Any, NamedTuple
 
@@ -37,13 +38,10 @@ AT = 0.11, 0.07
 
 
 class Needs(NamedTuple):
-    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow.
-
-    `smooth` are the conditions on which the optics depend smoothly.
-    """
+    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow."""
 
     conditions: frozenset[str]
-    smooth: frozenset[str]
+    smooth: frozenset[str]  # those on which the optics depend smoothly
     median: bool
     path_difference: float  # µm
 
@@ -64,8 +62,8 @@ def needs(instrument: Instrument) -> Needs:
 
     (patched, _), quantities = _asking(run, instrument)
     longest = max((element.path_difference for element in patched.by_place().values()), default=0.0)
-    exact, smooth = _sorted_out(quantities - {"median"})
-    return Needs(exact | smooth, smooth - exact, "median" in quantities, longest)
+    conditions = frozenset(name.removeprefix(SMOOTH) for name in quantities - {"median"})
+    return Needs(conditions, conditions - quantities, "median" in quantities, longest)
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
@@ -78,12 +76,6 @@ def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozense
             if missing.asked in quantities:
                 raise
             quantities |= {missing.asked}
-
-
-def _sorted_out(quantities: Set[str]) -> tuple[frozenset[str], frozenset[str]]:
-    """Conditions that were asked for at their values, and those asked for as smooth ones."""
-    smooth = frozenset(name for name in quantities if name.startswith(SMOOTH))
-    return frozenset(quantities) - smooth, frozenset(name.removeprefix(SMOOTH) for name in smooth)
 
 
 def optical_indices(instrument: Instrument) -> Int[np.ndarray, " o"]:
@@ -129,8 +121,8 @@ def conditions_of_effect(bare: Instrument, effect: Effect) -> frozenset[str]:
         before = {id(element) for element in _behind_polariser(bare)}
         return [element for element in _behind_polariser(effect.patch(bare)) if id(element) not in before]
 
-    asked = frozenset().union(*map(_conditions_asked, jax.eval_shape(changed, bare, effect)))
-    return frozenset().union(*_sorted_out(asked))
+    asked = map(_conditions_asked, jax.eval_shape(changed, bare, effect))
+    return frozenset(name.removeprefix(SMOOTH) for name in itertools.chain.from_iterable(asked))
 
 
 def _behind_polariser(instrument: Instrument) -> Iterator[Element]:

@@ -85,9 +85,8 @@ def with_numbers(
 ) -> Plan:
     """The plan of a single setting with other numbers; `teff` is 0 for a flat spectrum."""
     numbers = {"temperature": temperature, "hour_angle": hour_angle}
-    conditions = numbers | {SMOOTH + name: value for name, value in numbers.items()}
     planned = {
-        name: jnp.broadcast_to(conditions[name], plan.wavelength.shape) if name in conditions else value
+        name: jnp.broadcast_to(numbers.get(name.removeprefix(SMOOTH), value), plan.wavelength.shape)
         for name, value in plan.conditions.planned.items()
     }
     changed = (jnp.broadcast_to(teff, plan.teff.shape), Conditions(plan.conditions.band_width, planned))

@@ -278,8 +278,10 @@ def _plan(
 
     curves = {name: filters[name] for name in sorted({name for _, name, *_ in bands})}
     extrapolations(patched, curves.values())
-    swings = [0.5 * np.ptp(values[name]) * _phase_slope(patched, name, curves.values()) for name in smooth]
-    groups, share = _points([band[1:4] for band in bands], [nodes_for(float(swing)) for swing in swings])
+    # Phases that grow with hours or the hour angle are small.
+    slopes = {"temperature": _phase_per_kelvin(patched, curves.values())} if smooth else {}
+    swings = (0.5 * float(np.ptp(values[name])) * slopes.get(name, 0.0) for name in smooth)
+    groups, share = _points([band[1:4] for band in bands], [*map(nodes_for, swings)])
     rules = {
         name: _rule(
             tuple(c.wavelength.tolist()),
@@ -389,22 +391,12 @@ def nodes_for(swing: float) -> int:
     return count
 
 
-def _phase_slope(instrument: Instrument, name: str, curves: Iterable[FilterCurve]) -> float:
-    """Largest change of a retardance (rad) of an instrument (patched) with a condition, in its unit.
-
-    Of temperature that of all layers of the thickest plate, at twice the published change; others are small.
-    """
+def _phase_per_kelvin(instrument: Instrument, curves: Iterable[FilterCurve]) -> float:
+    """Largest change of a phase (rad) in an instrument (patched): of all layers of a plate, twice the published one."""
     bright = np.concatenate([curve.wavelength[curve.throughput > 0] for curve in curves])
-    if name != "temperature" or not bright.size:
-        return 0.0
-    slopes = [0.0]
-    for element in instrument.ahead_of_analysers():
-        if waves := element.retardances(bright[[bright.argmin()]]):
-            thermal = max(
-                (abs(c.thermal) for n, c in CRYSTALS.items() if n in element.materials), default=0.0
-            )
-            slopes.append(2.0 * 2.0 * np.pi * float(waves[1][0]) * thermal)
-    return max(slopes)
+    plates = (element.retardances(bright) for element in instrument.ahead_of_analysers())
+    waves = max((of_layers.max(initial=0.0) for _, of_layers in filter(None, plates)), default=0.0)
+    return float(4.0 * np.pi * waves * max(crystal.thermal for crystal in CRYSTALS.values()))
 
 
 def _rows(columns: list[Float[np.ndarray, " n"]], count: int) -> list[tuple[float, ...]]:
