@@ -121,7 +121,7 @@ def instrument(*effects: Effect) -> Instrument:
 def counts(instrument: Instrument, plan: Plan, data: engine.PointData) -> jax.Array:
     """Electrons that the cameras report for light of flux `FLUX`; not compiled."""
     unit = engine.prediction.__wrapped__(instrument, plan, data)
-    return engine.detected.__wrapped__(instrument, plan.exposures, FLUX * unit)
+    return engine.detected.__wrapped__(instrument, plan.exposures, FLUX * unit, data.x, data.y)
 
 
 def observe(*effects: Effect, plan_of: Sequence[Effect] | None = None) -> np.ndarray:
@@ -130,5 +130,7 @@ def observe(*effects: Effect, plan_of: Sequence[Effect] | None = None) -> np.nda
     device = instrument(*effects)
     data = points(layout)
     return np.asarray(
-        engine.detected(device, layout.exposures, FLUX * engine.prediction(device, layout, data))
+        engine.detected(
+            device, layout.exposures, FLUX * engine.prediction(device, layout, data), data.x, data.y
+        )
     )

@@ -41,6 +41,7 @@ SENTENCES = (
     "gain of half1 * ring 3",
     "gain of E1 * exposure 3",
     "gain of O1 * counts",
+    "gain of half2 * root counts * r2",
     "light of E1 in O1",
     "light in O2 * hours",
     "light of opposite in E2",

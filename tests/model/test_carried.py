@@ -62,7 +62,9 @@ def star_counts(*effects: Effect) -> np.ndarray:
         source=jnp.asarray(np.broadcast_to(SOURCE, (n, e))),
         band=jnp.asarray(np.broadcast_to(plan.band_of[np.arange(e), SOURCE + 1], (n, e))), opposite_sky=sky,
     )  # fmt: skip
-    return np.asarray(engine.detected(device, plan.exposures, FLUX * engine.prediction(device, plan, data)))
+    return np.asarray(
+        engine.detected(device, plan.exposures, FLUX * engine.prediction(device, plan, data), data.x, data.y)
+    )
 
 
 def matrix_of_counts(counts: np.ndarray) -> np.ndarray:
@@ -221,7 +223,8 @@ def test_what_acts_on_counts_is_no_part_of_the_product(name):
 def test_what_a_detector_does_to_its_own_counts_is_undone(name):
     assert dependence.left_behind(alone(name)) == ()
     shown, linear = star_counts(*among(name)), star_counts()
-    again = np.asarray(dependence.reported(alone(name), jnp.asarray(linear.reshape(-1, 4))))
+    at = (jnp.asarray(np.repeat(places, linear.shape[1])) for places in (X, Y))
+    again = np.asarray(dependence.reported(alone(name), jnp.asarray(linear.reshape(-1, 4)), *at))
     np.testing.assert_allclose(again.reshape(linear.shape), shown, rtol=1e-12)
 
 
@@ -289,7 +292,7 @@ class Offset(DetectorPart):
 
     level: Scalar
 
-    def reported(self, counts, exposures):
+    def reported(self, counts, exposures, x, y):
         return counts + self.level
 
 
@@ -312,4 +315,5 @@ def test_optics_that_change_with_time_are_left_behind():
 def test_a_detector_that_nobody_knows_is_undone():
     assert dependence.left_behind(instrument(Bias())) == ()
     counts = jnp.asarray([[1e5, 2e5, 3e5, 4e5]])
-    np.testing.assert_allclose(dependence.reported(instrument(Bias()), counts), counts + 50.0, rtol=1e-15)
+    shown = dependence.reported(instrument(Bias()), counts, jnp.array([0.1]), jnp.array([0.2]))
+    np.testing.assert_allclose(shown, counts + 50.0, rtol=1e-15)

@@ -78,7 +78,9 @@ def measured(*effects: Effect) -> tuple[Instrument, object, engine.PointData]:
     flux = rng.uniform(2e5, 6e5, (2, 9, 1))
     flux[:, 8] = 1.0
     counts = np.asarray(
-        engine.detected(device, layout.exposures, flux * engine.prediction(device, layout, data))
+        engine.detected(
+            device, layout.exposures, flux * engine.prediction(device, layout, data), data.x, data.y
+        )
     )
     counts = counts * (1.0 + 0.01 * rng.standard_normal(counts.shape))
     weight = 1.0 / np.sqrt(counts + 900.0)

@@ -17,13 +17,13 @@ from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import in_memory, read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
 from walop_jax.science.apply import COOL, HOT, apply
 from walop_jax.science.catalogue import read_catalogue
-from walop_jax.science.detectors import linearised
+from walop_jax.science.detectors import errors_of, linearised
 from walop_jax.simulation.simulate import simulate
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")
@@ -321,7 +321,9 @@ def test_detectors_and_rotator_of_the_model(calset, calibration, tmp_path):
     model = with_effects(calibration.model, [effect], context)
     there = _with(calibration, model)
     counts = np.array([[1e5, 5e5, 1e6, 2e6]])
-    np.testing.assert_allclose(linearised(there, counts * (1 + 0.02 * counts / 1e6)), counts, rtol=1e-12)
+    anywhere = np.array([0.1]), np.array([0.2])
+    shown = counts * (1 + 0.02 * counts / 1e6)
+    np.testing.assert_allclose(linearised(there, shown, *anywhere), counts, rtol=1e-12)
     assert there.left_behind == ()
     drift = effect_by_name("camera_gain_drift").of(context)
     drifting = _with(calibration, with_effects(calibration.model, [drift], context))
@@ -362,6 +364,23 @@ def test_errors_of_a_detector_grow_with_the_light(calset, calibration, tmp_path,
     stated = np.sqrt(np.einsum("sii->si", apply(there, read(table, tmp_path)).calibration))
     np.testing.assert_allclose(stated, np.abs(shift), rtol=1e-3, atol=1e-9)
     assert stated.max() > 3e-4 * flux / 4e6
+
+
+def test_detectors_that_differ_over_the_field_are_undone_star_by_star(calset, calibration):
+    context = _context(calset)
+    trails = Described.saying(["gain of E1 * root counts * y"], [-0.03])
+    there = _with(calibration, with_effects(calibration.model, [trails], context))
+    counts = np.random.default_rng(3).uniform(1e4, 2e6, (7, 4))
+    x, y = np.random.default_rng(4).uniform(-0.25, 0.25, (2, 7))
+    shown = counts.copy()
+    shown[:, 1] *= 1.0 - 0.03 * np.sqrt(counts[:, 1] / 1e6) * y / 0.3
+    np.testing.assert_allclose(linearised(there, shown, x, y), counts, rtol=1e-11)
+    slope = 1.0 - 0.045 * np.sqrt(counts[:, 1] / 1e6) * y / 0.3
+    sigma = np.ones_like(counts)
+    found = errors_of(there, counts, sigma, x, y)
+    np.testing.assert_allclose(found[:, 1], 1.0 / slope, rtol=1e-11)
+    np.testing.assert_array_equal(found[:, [0, 2, 3]], 1.0)
+    assert there.left_behind == ()
 
 
 def test_photon_errors_are_those_of_linearised_counts(calset, calibration):

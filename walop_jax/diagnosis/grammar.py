@@ -29,6 +29,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.hypotheses import FEWEST_POINTS, Hypotheses, Probe, applicable, probes, sentences_of
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, EffectKind
+from walop_jax.model.effects.cameras import POWERS
 from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
@@ -409,7 +410,7 @@ _SHOWS: Mapping[str, Callable[[Dependences], bool]] = {
     "colour": lambda of: len(np.unique(of.exposures.filter)) > 1,
     "hours": lambda of: varies(of.exposures.mjd),
     "kelvin": lambda of: varies(of.exposures.temp),
-    "counts": lambda of: True,
+    **dict.fromkeys(POWERS, lambda of: True),
     "hour angle": Dependences._shows_hour_angle,
     "per EXPTIME": Dependences._shows_exptime,
     "order": Dependences._shows_order,

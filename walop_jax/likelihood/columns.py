@@ -94,13 +94,13 @@ def _own_at_point(
 
     def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
         active = put(amplitudes)
-        return real_counts(active, plan, point_prediction(active, plan, point), flux)
+        return real_counts(active, plan, point_prediction(active, plan, point), flux, point)
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
     size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
     change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
-    along = counts_and_slope(at_neutral, plan, unit, flux)[1] * point.weight
+    along = counts_and_slope(at_neutral, plan, unit, flux, point)[1] * point.weight
     projected = project_flux(change, along, plan.exposures.flux_known, sharing(instrument, plan, point))
     return -projected.reshape(len(change), -1).T
 
@@ -149,7 +149,7 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     direct = jnp.ones_like(unit)
     ghost_share = light.with_ghosts(instrument, jnp.zeros_like(unit), direct, point.source)
     flux = best_flux(instrument, plan, unit, point)
-    reported, along = counts_and_slope(instrument, plan, unit, flux)
+    reported, along = counts_and_slope(instrument, plan, unit, flux, point)
     share, ghost = jnp.stack([direct, ghost_share])[:sites], Ghost(jnp.ones(unit.shape[1]))
     opposite = ghost.seen(point.source < 0, opposite)
     added = {stage: add(reported, plan.exposures) for stage, add in ADDED.items() if stage != "median"}
@@ -165,14 +165,21 @@ def _visibilities(instrument: Instrument, plan: Plan, gaps: Float[Array, " g"]) 
 
 
 def _pushed(
-    instrument: Instrument, plan: Plan, counts: Float[Array, "p e k"], change: Float[Array, "a p e k"]
+    instrument: Instrument,
+    plan: Plan,
+    counts: Float[Array, "p e k"],
+    change: Float[Array, "a p e k"],
+    x: Float[Array, " p"],
+    y: Float[Array, " p"],
 ) -> Float[Array, "a p e k"]:
     """Change of the counts that the detectors report, for counts that change."""
 
-    def at(counts: Float[Array, "e k"], change: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        return jax.jvp(lambda n: light.detected(instrument, plan.exposures, n), (counts,), (change,))[1]
+    def at(
+        counts: Float[Array, "e k"], change: Float[Array, "e k"], x: Float[Array, ""], y: Float[Array, ""]
+    ) -> Float[Array, "e k"]:
+        return jax.jvp(lambda n: light.detected(instrument, plan.exposures, n, x, y), (counts,), (change,))[1]
 
-    return jax.vmap(jax.vmap(at), (None, 0))(counts, change)
+    return jax.vmap(jax.vmap(at), (None, 0, None, None))(counts, change, x, y)
 
 
 def _at_each(instrument: Instrument, plan: Plan, points: PointData) -> _AtPoint:
@@ -470,7 +477,9 @@ class ResponseBlock:
         of, size = self.of, limits.COLUMNS_TOGETHER // 4
         cube = np.zeros((size, *self.used.shape, self.cameras))
         cube[: len(change)] = np.moveaxis(change.reshape(len(change), self.cameras, *self.used.shape), 1, -1)
-        pushed = np.asarray(_detectors(of.instrument, of.plan, self.found.electrons, cube))[: len(change)]
+        pushed = np.asarray(_detectors(of.instrument, of.plan, self.found.electrons, cube, self.x, self.y))[
+            : len(change)
+        ]
         return np.moveaxis(pushed, -1, 1).reshape(change.shape)
 
     def _write(self, change: Float[np.ndarray, "a k n"], columns: Float[np.ndarray, "a d"]) -> None:

@@ -135,21 +135,23 @@ def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
-            counts, slope = counts_and_slope(instrument, plan, unit, flux)
+            counts, slope = counts_and_slope(instrument, plan, unit, flux, point)
             missing = (point.counts - counts) * point.weight
             step, _ = eliminate_flux(missing, slope * point.weight, flux_known, shared)
             flux = jnp.where(flux_known[:, None], flux, flux + step)
     return flux
 
 
-def real_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux) -> Counts:
+def real_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData) -> Counts:
     """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
-    return light.detected(instrument, plan.exposures, flux * unit)
+    return light.detected(instrument, plan.exposures, flux * unit, point.x, point.y)
 
 
-def counts_and_slope(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux) -> tuple[Counts, Counts]:
+def counts_and_slope(
+    instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData
+) -> tuple[Counts, Counts]:
     """The same, and their derivative with respect to the flux."""
-    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f), (flux,), (jnp.ones_like(flux),))
+    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f, point), (flux,), (jnp.ones_like(flux),))
 
 
 def point_residuals(
@@ -162,7 +164,7 @@ def point_residuals(
 def residuals_of(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> tuple[Flux, Counts]:
     """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
-    residual = (point.counts - real_counts(instrument, plan, unit, flux)) * point.weight
+    residual = (point.counts - real_counts(instrument, plan, unit, flux, point)) * point.weight
     return flux, sharing(instrument, plan, point).independent(residual)
 
 
@@ -222,7 +224,7 @@ def _point_jacobian(
     if not light.is_linear(instrument):
         values = values_of(instrument)
         counts, push_detector = jax.linearize(
-            lambda v, n: light.detected(to_instrument(v), plan.exposures, n), values, counts
+            lambda v, n: light.detected(to_instrument(v), plan.exposures, n, point.x, point.y), values, counts
         )
         unit_steps = jnp.eye(values.size)[plain_positions(instrument)]
         all_values = jnp.concatenate([unit_steps, jnp.zeros((throughput.size, values.size))])
@@ -332,4 +334,4 @@ prediction = compiled(
     jax.vmap(point_prediction, (None, None, 0)), optimised_above=limits.OPTIMISED_ABOVE, kept_as="prediction"
 )
 """Counts for light of unit flux; `detected` takes electrons, flux × these, through the detectors."""
-detected = compiled(jax.vmap(light.detected, (None, None, 0)), kept_as="detected")
+detected = compiled(jax.vmap(light.detected, (None, None, 0, 0, 0)), kept_as="detected")

@@ -148,7 +148,7 @@ class Forward(eqx.Module):
         def of(point: PointData, flux: Array | None) -> Array:
             instrument, unit = self._unit(values, point)
             flux = engine.best_flux(instrument, self.plan, unit, point) if flux is None else flux
-            return engine.real_counts(instrument, self.plan, unit, flux)
+            return engine.real_counts(instrument, self.plan, unit, flux, point)
 
         return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, flux)))
 

@@ -27,6 +27,9 @@ from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.sources import ExposureArrays, Scalar
 
+Places = Scalar | Float[Array, " e"]
+"""Field coordinate (deg) of all exposures, or of each."""
+
 
 class Throughput(Component):
     """Throughput of each camera as a Legendre series over the field (total degree `degree`)."""
@@ -99,8 +102,10 @@ class DetectorPart(Component):
     """Response of a detector to electrons."""
 
     @abc.abstractmethod
-    def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
-        """Reported counts for arriving counts (electrons)."""
+    def reported(
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+    ) -> Float[Array, "e k"]:
+        """Reported counts for arriving counts (electrons) at a field point (deg), or at one for each row (e)."""
 
 
 class Cameras(Component):

@@ -6,7 +6,8 @@ parameter through the operations of `light.band_rows`: those that reach the resu
 Not all of an instrument is valid for exposures other than the fitted ones. The instrument matrix and the analysis of a
 catalogue use the optics and the cameras. Light of the opposite field point, shares of single exposures, optics that
 change with the time since the first exposure and detectors that depend on their exposure do not carry over; the
-response of a detector to its own counts alone is inverted. Patching shows the effects concerned; they are not declared.
+response of a detector to its own counts, which may differ over the field, is inverted. Patching shows the effects
+concerned; they are not declared.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def needs(instrument: Instrument) -> Needs:
         zeros = jnp.zeros_like(plan.exposures.kind)
         sight = Sight(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
         counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
-        return patched, light.detected(patched, plan.exposures, counts)
+        return patched, light.detected(patched, plan.exposures, counts, x, y)
 
     (patched, _), quantities = _asking(run, instrument)
     longest = max((element.path_difference for element in patched.by_place().values()), default=0.0)
@@ -154,9 +155,11 @@ class _Unknown(ExposureArrays):
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
-    """True for a detector that depends on its own counts alone, so that catalogues can be corrected for it."""
+    """True for a detector that depends on its own counts and the field, so that catalogues can be corrected for it."""
     try:
-        jax.eval_shape(lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown)), part)
+        jax.eval_shape(
+            lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown), *map(jnp.asarray, AT)), part
+        )
     except NotPlannedError:
         return False
     return True
@@ -176,9 +179,11 @@ def left_behind(instrument: Instrument) -> tuple[str, ...]:
     return tuple(names)
 
 
-def reported(instrument: Instrument, counts: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Reported counts for counts (electrons), by the detectors with an inverse."""
+def reported(
+    instrument: Instrument, counts: Float[Array, "n k"], x: Float[Array, " n"], y: Float[Array, " n"]
+) -> Float[Array, "n k"]:
+    """Reported counts for counts (electrons) at field points (deg), by the detectors with an inverse."""
     for detector in instrument.patched().cameras.detectors:
         if is_undone(detector, len(instrument.cameras)):
-            counts = detector.reported(counts, blank(_Unknown))
+            counts = detector.reported(counts, blank(_Unknown), x, y)
     return counts

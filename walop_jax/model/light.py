@@ -322,10 +322,12 @@ def is_linear(instrument: LightPath) -> bool:
     return not instrument.patched().cameras.detectors
 
 
-def detected(instrument: LightPath, exposures: ExposureArrays, counts: Counts) -> Counts:
+def detected(
+    instrument: LightPath, exposures: ExposureArrays, counts: Counts, x: Scalar, y: Scalar
+) -> Counts:
     """Counts reported by the detectors for counts in electrons: the only stage non-linear in the light."""
     for detector in instrument.patched().cameras.detectors:
-        counts = detector.reported(counts, exposures)
+        counts = detector.reported(counts, exposures, x, y)
     return counts
 
 

@@ -159,8 +159,12 @@ class _Application:
         self.settings, self.setting_of = _settings(self.vectors, catalogue)
         if not force:
             check_validity(calibration, catalogue.points.settings)
-        self.counts = linearised(calibration, catalogue.counts)
-        self.sigma = errors_of(calibration, self.counts, catalogue.sigma)
+        at = (
+            np.nan_to_num(catalogue.points.x),
+            np.nan_to_num(catalogue.points.y),
+        )  # those without are `outside`
+        self.counts = linearised(calibration, catalogue.counts, *at)
+        self.sigma = errors_of(calibration, self.counts, catalogue.sigma, *at)
         self.offset, self.slope = _rotator_zero(self.vectors)
         self.order = np.argsort(catalogue.star, kind="stable")
         self.on_sky = bool(np.isfinite(catalogue.rotator).any())
@@ -209,7 +213,7 @@ class _Application:
             gain = fitted.gain[same]
             of_plain, of_throughput = gain @ plain[same], gain @ throughput[same]
             derivative[same] = vectors.to_parameters(of_plain, of_throughput, x[same], y[same])
-        for p, change in detector_slopes(vectors, counts):
+        for p, change in detector_slopes(vectors, counts, x, y):
             change = fitted.relative(change)
             plain[..., p] -= change
             derivative[..., p] -= np.einsum("rik,rk->ri", fitted.gain, change)

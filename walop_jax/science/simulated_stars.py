@@ -101,8 +101,8 @@ def simulated_stars(
     expected = flux[:, None] * np.einsum("pc,pcks,ps->pk", colour_weights(teff, COLOURS), vectors, stokes)
     if not light.is_linear(instrument):
         single = jax.tree.map(lambda leaf: leaf[:1], layout.exposures)
-        detected = jax.vmap(lambda n: light.detected(instrument, single, n[None])[0])
-        expected = np.asarray(detected(array(expected)))
+        detected = jax.vmap(lambda n, x, y: light.detected(instrument, single, n[None], x, y)[0])
+        expected = np.asarray(detected(*map(array, (expected, x, y))))
     noise = PhotonNoise(plan.read_noise)
     counts, sigma = (expected, noise.sigma(expected)) if noiseless else noise.draw(photons, expected)
     columns: Columns = {

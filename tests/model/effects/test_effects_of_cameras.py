@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import effect_scenes as scenes
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from quick import quick
 
 from walop_jax.likelihood import engine
 from walop_jax.model import light
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.simulation.simulate import effect_from_text
 
 COUNTS = jnp.array([[1e5, 2e5, 3e5, 4e5]] * 9)
+AT = jnp.array([0.1, 0.2])
 
 
 def make(name: str, **values):
@@ -24,7 +26,7 @@ def make(name: str, **values):
 
 
 def detected(*effects) -> np.ndarray:
-    return np.asarray(light.detected(scenes.instrument(*effects), scenes.plan().exposures, COUNTS))
+    return np.asarray(light.detected(scenes.instrument(*effects), scenes.plan().exposures, COUNTS, *AT))
 
 
 def test_leakage_mixes_orthogonal_cameras():
@@ -52,12 +54,42 @@ def test_pedestal_by_hand():
 def test_pedestal_needs_the_medians():
     exposures = dataclasses.replace(scenes.plan().exposures, median_counts=None)
     with pytest.raises(ValueError, match="median"):
-        light.detected(scenes.instrument(make("pedestal")), exposures, COUNTS)
+        light.detected(scenes.instrument(make("pedestal")), exposures, COUNTS, *AT)
 
 
 def test_nonlinearity_by_hand():
     found = detected(make("nonlinearity", coefficient=[0.0, 0.02, 0.0, -0.01]))
     assert found[0] == pytest.approx([1e5, 2e5 * 1.004, 3e5, 4e5 * 0.996], rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("factors", "expected"),
+    [
+        ("counts", [0.02 * 0.4, 0.0]),  # 0.02 · 4·10⁵ / 10⁶
+        ("root counts", [0.02 * 0.4**0.5, 0.02 / 1e3]),  # of one electron: (1 / 10⁶)^½
+        ("counts squared", [0.02 * 0.16, 0.0]),
+        ("counts * y", [0.02 * 0.4 * 0.2 / 0.3, 0.0]),  # at y = 0.2, of the amplitude at 0.3°
+        ("root counts * x * hours", [0.02 * 0.4**0.5 * 0.1 / 0.3 * 3.6, 0.02 / 1e3 * 0.1 / 0.3 * 3.6]),
+    ],
+)
+def test_gains_that_grow_with_a_power_of_the_counts_by_hand(factors, expected):
+    device = scenes.instrument(Described.saying([f"gain of E2 * {factors}"], [0.02]))
+    counts = COUNTS.at[4].set(jnp.array([0.0, 0.0, 0.0, 1.0]))
+
+    def reported(n):
+        return light.detected(device, scenes.plan().exposures, n, *AT)
+
+    found, slope = jax.jvp(reported, (counts,), (jnp.ones_like(counts),))
+    hours = np.asarray(scenes.plan().exposures.hours)[5] / 3.6 if "hours" in factors else 1.0
+    assert found[5, 3] / 4e5 - 1.0 == pytest.approx(expected[0] * hours, rel=1e-10)
+    assert found[4, 3] - 1.0 == pytest.approx(expected[1], abs=1e-7)
+    np.testing.assert_array_equal(found[:, :3], counts[:, :3])
+    assert np.isfinite(slope).all()
+
+
+def test_a_gain_grows_with_one_power_of_the_counts():
+    with pytest.raises(ValueError, match="grows with one of root counts, counts, counts squared"):
+        scenes.instrument(Described.saying(["gain of E2 * counts * root counts"], [0.02])).patched()
 
 
 def test_gain_drift_by_hand():
@@ -113,7 +145,9 @@ def measured(*effects) -> tuple[engine.PointData, object]:
     device = scenes.instrument(*effects)
     flux = np.random.default_rng(2).uniform(2e5, 6e5, (2, 9, 1))
     flux[:, 8] = 1.0
-    counts = engine.detected(device, layout.exposures, flux * engine.prediction(device, layout, data))
+    counts = engine.detected(
+        device, layout.exposures, flux * engine.prediction(device, layout, data), data.x, data.y
+    )
     weight = 1.0 / jnp.sqrt(counts + 900.0)
     return data._replace(counts=counts, weight=weight), layout
 

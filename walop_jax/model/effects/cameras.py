@@ -1,7 +1,7 @@
 """Changes of cameras and detectors: gains, light from elsewhere, afterglow of the preceding exposure.
 
 Equation    N_k → N_k + a f g_k, with g_k
-            gain           N_k; growing with the counts: N_k² / 10⁶
+            gain           N_k; growing with the counts to the power p: N_k (N_k / 10⁶)^p
             reported gain  N_k as reported, behind all other changes of the detector
             light          N_j of another camera; of no origin: the median counts of the exposure; of opposite: N_k at
                            (−X, −Y), extended sources only
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Transmission
+from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Places, Transmission
 from walop_jax.model.effects.change import (
     KINDS,
     OPPOSITE,
@@ -110,13 +110,22 @@ def _before(counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Arr
     return jnp.zeros_like(counts).at[order[1:]].set(counts[order[:-1]])
 
 
+def _root(counts: Float[Array, "e k"], _: ExposureArrays) -> Float[Array, "e k"]:
+    """N √(N/N₀), which is proportional to N below one electron: its derivatives are finite at 0."""
+    return counts * jnp.sqrt(jnp.maximum(counts, 1.0) / REFERENCE_COUNTS)
+
+
 ADDED: Mapping[str, Callable[[Float[Array, "e k"], ExposureArrays], Float[Array, "e k"]]] = {
+    "root": _root,
     "square": lambda counts, _: counts**2 / REFERENCE_COUNTS,
+    "cube": lambda counts, _: counts**3 / REFERENCE_COUNTS**2,
     "reported": lambda counts, _: counts,
     "median": lambda _, exposures: exposures.median,
     "afterglow": _before,
 }
-"""Additions to arriving counts by a change of amplitude 1 without factors, by stage."""
+"""Additions to arriving counts by a change of amplitude 1 without further factors, by stage."""
+POWERS = {"root counts": "root", "counts": "square", "counts squared": "cube"}
+"""Stages of gains that grow with a power of their counts, by factor."""
 
 
 class OfDetectors(_Cameras, DetectorPart):
@@ -124,14 +133,15 @@ class OfDetectors(_Cameras, DetectorPart):
 
     stage: str = eqx.field(static=True, default="reported")
 
-    def reported(self, counts: Float[Array, "e k"], exposures: ExposureArrays) -> Float[Array, "e k"]:
+    def reported(
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+    ) -> Float[Array, "e k"]:
         """Counts with the additions."""
         added, total = ADDED[self.stage](counts, exposures), counts
         for change, size in zip(self.changes, self.sizes, strict=True):
-            if any(factor.depends_on != COUNTS for factor in change.grows_with):
-                total = total + size * added * in_exposures(change, exposures)[:, None]
-            else:
-                total = total + size * added
+            of_exposures = any(factor.depends_on == EXPOSURE for factor in change.grows_with)
+            pattern = in_exposures(change, exposures, x, y) if of_exposures else change.factor(AtPoint(x, y))
+            total = total + size * added * jnp.asarray(pattern, float)[..., None]
         return total
 
 
@@ -141,8 +151,10 @@ def stage_of(change: Change) -> str:
         return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
     if change.kind != "gain":
         return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
-    if "counts" in change.factors:
-        return "square"
+    if powers := [factor.text for factor in change.grows_with if factor.depends_on == COUNTS]:
+        if len(powers) > 1:
+            raise ValueError(f"{change.text!r}: a gain grows with one of {', '.join(POWERS)}")
+        return POWERS[powers[0]]
     still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     return "throughput" if still else "counts"
 
@@ -168,7 +180,7 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 _WITH: Mapping[str, tuple[str, ...]] = {
-    "square": (COUNTS, EXPOSURE),
+    **dict.fromkeys(POWERS.values(), (COUNTS, FIELD, EXPOSURE)),
     "reported": (EXPOSURE,),
     "median": (EXPOSURE,),
     "afterglow": (EXPOSURE,),
@@ -178,7 +190,8 @@ _WITH: Mapping[str, tuple[str, ...]] = {
 
 
 _CAMERA = (
-    Combinations(along=("counts",), among=("alone", "all")),
+    Combinations(along=tuple(POWERS), among=("alone", "all")),
+    Combinations(("smooth",), tuple(POWERS), ("alone", "arm")),
     Combinations(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
     Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that moves in a circle
     Combinations(("tilt", "focus"), SLOW),

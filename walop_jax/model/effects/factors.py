@@ -129,6 +129,10 @@ def _since_evening(at: Any, _: Units) -> Any:
     return xp.take_along_axis(since, xp.argsort(order, axis=-1), axis=-1)
 
 
+def _one(at: Any, _: Units) -> float:
+    return 1.0
+
+
 PLAIN: Mapping[str, Factor] = {
     item.text: item
     for item in (
@@ -178,10 +182,14 @@ PLAIN: Mapping[str, Factor] = {
             "night hours", EXPOSURE, "growing through every night (per hour since its first exposure)",
             "the same exposures of a night in another order", _since_evening, "night hours",
         ),
-        Factor(
-            # The detector multiplies with its own counts.
-            "counts", COUNTS, "growing with the counts (at 10⁶ electrons)", "the same exposures at another flux",
-            lambda at, _: 1.0,
+        # The detector multiplies with its own counts.
+        *(
+            Factor(text, COUNTS, f"growing with {of} (at 10⁶ electrons)", "the same exposures at another flux", _one)
+            for text, of in (
+                ("counts", "the counts"),
+                ("root counts", "the root of the counts"),
+                ("counts squared", "the square of the counts"),
+            )
         ),
     )
 }  # fmt: skip
