@@ -17,6 +17,7 @@ import walop_jax as walop
 from walop_jax.commands.command import Command, Outcome, given, typed
 from walop_jax.fit import search
 from walop_jax.fit.outliers import Clipped
+from walop_jax.posterior.run import Run
 
 PLAN = "grid = 2\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
 
@@ -151,6 +152,15 @@ def test_sets_are_read_with_the_kinds_of_exposures_of_the_calibration(command: s
     old, new = fitted.calibration, fitted.calset
     with pytest.raises(Begun, match="WALOP-SOUTH"):
         walop.epoch(old, new) if command == "epoch" else walop.compare(new, old)
+
+
+def test_a_run_reads_its_data_with_the_kinds_of_exposures_of_its_instrument(run, monkeypatch):
+    def read(*paths: Any, kinds: Any) -> Any:
+        raise Begun(", ".join(kinds))
+
+    monkeypatch.setattr("walop_jax.posterior.run.read_calibration_set", read)
+    with pytest.raises(Begun, match="moon, standard"):
+        _ = Run(run).calset
 
 
 def test_a_catalogue_that_cannot_be_read_leaves_the_others_their_tables(call, run, tmp_path, monkeypatch):

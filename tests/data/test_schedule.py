@@ -170,6 +170,14 @@ def test_the_night_is_that_of_the_site_however_its_longitude_is_counted(longitud
     assert schedule["targets"][1]["acquisition"][0]["window"]["start"] == "21:29:30"
 
 
+def test_patches_of_the_moon_sky_keep_their_places_without_names(tmp_path: Path):
+    exposures = PLAN.exposures()
+    exposures = dataclasses.replace(exposures, ra=exposures.ra + 0.1 * np.arange(len(exposures)))
+    schedule, _ = schedule_of(exposures, PLAN.site, FILTERS)
+    (tmp_path / "s.json").write_text(json.dumps(schedule))
+    same(exposures, read_schedule(tmp_path / "s.json", FILTERS)[0])
+
+
 def test_an_executed_schedule_has_times(tmp_path: Path):
     exposures = PLAN.exposures()
     schedule = written(tmp_path / "s.json", exposures)

@@ -272,6 +272,7 @@ def from_arrays(
     source: Any = None,
     sky: Any = None,
     origin: str = "",
+    compression: Compression | None = None,
     **exposures: Any,
 ) -> CalibrationSet:
     """A checked calibration set from arrays in memory.
@@ -283,8 +284,8 @@ def from_arrays(
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
     `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
     columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `sky` the level of the
-    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name. Quantities are
-    converted.
+    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name; `compression` is that
+    of a set that stands for whole frames. Quantities are converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
 
@@ -339,7 +340,8 @@ def from_arrays(
     if filters:
         tables["FILTERS"] = filter_columns(filters)
     site = site or Site("", _NAN, _NAN, _NAN)
-    calset = _in_memory(tables, instrument=instrument, site=site, origin=origin)
+    header = {"instrument": instrument, "site": site, "origin": origin, "compression": compression}
+    calset = _in_memory(tables, **header)
     return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
 
 

@@ -390,6 +390,7 @@ class CalibrationSet(Displayed):
             "filters": dict(self.filters),
             "sources": stars if len(self.sources) else None,
             "origin": self.origin,
+            "compression": self.compression,
         }
 
     def to_table(self) -> Any:

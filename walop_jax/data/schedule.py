@@ -69,8 +69,7 @@ def schedule_of(
     rounded = [float(t) for t in exposures.exptime if t != round(t) or t < 1]
     if rounded:
         remarks.append(f"{len(rounded)} exposure times are no whole seconds ({rounded[0]:g} s): rounded")
-    usual = {"clp": "calibration polariser", "moon": "Moon"}
-    label = [usual.get(kind, kind) for kind in map(str, exposures.kind)] if names is None else names
+    label = list(_labels(exposures)) if names is None else names
     kinds = ["CAL-UPO" if name in unpolarised else _type(each[e]) for e, name in enumerate(label)]
     night = _window(exposures.mjd, exposures.exptime, site)
     targets, objects = [], dict[str, dict[str, str]]()
@@ -93,6 +92,16 @@ def schedule_of(
     stated = {name: (facts or {}).get(name, text) for name, text in usual.items()}
     head = {"name": stated.pop("name"), "date": evening.date().isoformat(), **stated}
     return head | {"objects": list(objects.values()), "targets": targets}, remarks
+
+
+def _labels(exposures: Exposures) -> Iterator[str]:
+    """Names of targets by their KIND, numbered where exposures of a KIND have several places on the sky."""
+    usual = {"clp": "calibration polariser", "moon": "Moon"}
+    places = np.nan_to_num(np.stack([exposures.ra, exposures.dec], axis=1), nan=np.inf)
+    for kind, place in zip(exposures.kind, places, strict=True):
+        distinct = np.unique(places[exposures.kind == kind], axis=0)
+        number = f" {np.flatnonzero((distinct == place).all(axis=1))[0] + 1}" if len(distinct) > 1 else ""
+        yield usual.get(str(kind), str(kind)) + number
 
 
 def read_schedule(

@@ -101,7 +101,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         if not inputs:
             advice = "make it with walop-jax refit"
             raise fail("does not name the data of its fit", file=self.folder, advice=advice)
-        calset = read_calibration_set(*(self.data or [self._located(entry.path) for entry in inputs]))
+        paths = self.data or [self._located(entry.path) for entry in inputs]
+        calset = read_calibration_set(*paths, kinds=self.rebuilt.model.template.kinds)
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
         return calset

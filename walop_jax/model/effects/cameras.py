@@ -193,7 +193,9 @@ _CAMERA = (
     Combinations(along=tuple(POWERS), among=("alone", "arm", "all")),
     Combinations(("smooth",), tuple(POWERS), ("alone", "arm")),
     Combinations(along=("harmonics to 6", *SLOW, *SINGLE, "side", "night", "step", "exposure", "kind")),
-    Combinations(along=(*SLOW, *SINGLE, "side", "night", "step", "kind"), among=("arm",)),  # a contrast of two
+    Combinations(
+        along=(*SLOW, *SINGLE, "side", "night", "step", "kind"), among=("arm",)
+    ),  # a contrast of two
     Combinations(("tilt",), ("harmonics to 1",), ("alone", "all")),  # an image that moves in a circle
     Combinations(("tilt", "focus"), SLOW),
     Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
