@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from quick import quick
 from scipy import stats
 from small_run import SMALL
 
@@ -106,20 +107,18 @@ def test_a_lamp_of_another_temperature(calset):
     assert "TEFF of exposures of kind clp" in found.verdict.doubts[0]
 
 
-@pytest.mark.parametrize(
-    ("mistake", "says"),
-    [
-        (background, "does not explain the data"),
-        (displaced, "the residuals ask for X of all field points changed by −0.01"),
-        (dark, "camera O2"),
-        (variances, "N_ERR is not the standard error"),
-        (noisy_camera, "camera"),
-    ],
-)
-def test_a_mistake_in_the_data_is_not_trusted(
-    calset, mistake: Callable[[CalibrationSet], CalibrationSet], says: str
-):
-    found = refit(mistake(calset))
+MISTAKES = {
+    background: "does not explain the data",
+    displaced: "the residuals ask for X of all field points changed by −0.01",
+    dark: "camera O2",
+    variances: "N_ERR is not the standard error",
+    noisy_camera: "camera",
+}
+
+
+@pytest.mark.parametrize("mistake", quick(MISTAKES, [displaced, variances]))
+def test_a_mistake_in_the_data_is_not_trusted(calset, mistake: Callable[[CalibrationSet], CalibrationSet]):
+    found, says = refit(mistake(calset)), MISTAKES[mistake]
     assert found.converged
     assert not found.trusted
     assert says in "; ".join(found.warnings)
