@@ -43,7 +43,7 @@ def test_gains_are_those_of_normal_densities():
     common, more = np.ones((300, 1)), (UNIT != "clp")[:, None] * 1.0
     both = np.hstack([common, more])
     data = 0.2 + 0.2 * more[:, 0] + 0.5 * rng.standard_normal(300)  # quiet: χ² below its expectation
-    found = gains_of_units(UNIT, laid(common, data), laid(both, data, [1]))
+    found, _ = gains_of_units(UNIT, laid(common, data), laid(both, data, [1]))
     for gain, kind in zip(found, np.unique(UNIT), strict=True):
         by_densities = by_hand(both, data, kind, [1]) - by_hand(common, data, kind, [])
         assert gain == pytest.approx(by_densities, rel=1e-6, abs=1e-6)
@@ -55,11 +55,22 @@ def test_what_stands_in_for_something_else_is_contradicted():
     common, data = np.ones((300, 1)), rng.standard_normal(300) + 0.8 * (UNIT == "standard")
     right, wrong = (np.isin(UNIT, some)[:, None] * 1.0 for some in (["standard"], ["moon", "standard"]))
     base = laid(common, data)
-    true = gains_of_units(UNIT, base, laid(np.hstack([common, right]), data, [1]))
+    true, _ = gains_of_units(UNIT, base, laid(np.hstack([common, right]), data, [1]))
     assert true.min() > -0.5
     assert true[2] > 3.0
-    off = gains_of_units(UNIT, base, laid(np.hstack([common, wrong]), data, [1]))
+    off, misfit = gains_of_units(UNIT, base, laid(np.hstack([common, wrong]), data, [1]))
     assert off[1] < -3.0
+    assert misfit[1] < -3.0
+
+
+def test_a_prediction_that_has_only_become_broader_is_no_misfit():
+    """A number that only standards see, of no consequence there: ½ ln(1 + 100 w²) less probable, no farther off."""
+    data = np.random.default_rng(8).standard_normal(300)
+    data[UNIT == "standard"] -= data[UNIT == "standard"].mean()
+    common, more = np.ones((300, 1)), (UNIT == "standard")[:, None] * 100.0
+    gain, misfit = gains_of_units(UNIT, laid(common, data), laid(np.hstack([common, more]), data, [1]))
+    assert gain[2] == pytest.approx(-0.5 * np.log(1.0 + 100 * 100.0**2), abs=0.3)
+    assert abs(misfit[2]) < 0.3
 
 
 def test_errors_that_a_fit_has_scaled_make_its_densities_as_broad():
@@ -68,7 +79,7 @@ def test_errors_that_a_fit_has_scaled_make_its_densities_as_broad():
     columns, data = np.ones((300, 1)), rng.standard_normal(300)
     rows, residual, free, _ = laid(columns, data)
     scaled = rows / 5.0, residual / 5.0, free, 5.0
-    loss = gains_of_units(UNIT, (rows, residual, free, 1.0), scaled)
+    loss, _ = gains_of_units(UNIT, (rows, residual, free, 1.0), scaled)
     # ½ Σ r² − n ln 5 − ½ Σ r²/25, nearly: a unit of 100 rows is predicted by 200.
     squares = np.array([np.sum(residual[kind == UNIT] ** 2) for kind in np.unique(UNIT)])
     np.testing.assert_allclose(loss, 0.5 * squares * (1 - 1 / 25) - 100 * np.log(5.0), rtol=0.02)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -189,9 +189,17 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 
 
 def contradicting(before: Design, after: Design) -> str:
-    """KINDs of exposures that all others predict worse with the additions of a fit; empty: none."""
-    gains = gains_by_kind(before, after)
-    return ", ".join(f"KIND {kind}" for kind, gain in gains.items() if gain < -thresholds.EVEN_ODDS)
+    """KINDs of exposures that all others predict worse with the additions of a fit; empty: none.
+
+    Worse is both less probable and farther off in units of the error of the prediction, which is χ² of it: a prediction
+    that has only become broader contradicts nothing.
+    """
+    worse = (
+        name
+        for name, (gain, misfit) in gains_by_kind(before, after).items()
+        if gain < -thresholds.EVEN_ODDS and misfit < -thresholds.EVEN_ODDS
+    )
+    return ", ".join(f"KIND {kind}" for kind in worse)
 
 
 def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> list[Trial]:
@@ -269,7 +277,7 @@ def predicts_unseen(
     for kind, unit in units:
         before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
         after = _predictions(rows, residual, unit, design.projector.free)
-        gain, closer = (after - before).T
+        gain, closer = after.density - before.density, after.distance - before.distance
         if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
             return False
         if kind == "states" and closer.mean() > 0.0:
@@ -277,8 +285,10 @@ def predicts_unseen(
     return True
 
 
-def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
+def gains_by_kind(before: Design, after: Design) -> dict[str, tuple[float, float]]:
     """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
+
+    The second number is the share of misfits in it, −½ Δχ² of the predictions.
 
     Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
     The gains of a KIND and of all others by themselves add up to the evidence.
@@ -288,29 +298,43 @@ def gains_by_kind(before: Design, after: Design) -> dict[str, float]:
     if len(names) < 2:
         return {}
     first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    return dict(zip(map(str, names), gains_of_units(kinds, first, second).tolist(), strict=True))
+    gains = map(tuple, gains_of_units(kinds, first, second).T.tolist())
+    return dict(zip(map(str, names), gains, strict=True))
 
 
-def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, " u"]:
-    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another.
+def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, "2 u"]:
+    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another, and −½ Δχ².
+
+    χ² is that of the prediction, in both models with the errors of that which leaves less scatter.
 
     Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
     errors in whose units the data rows are.
     """
-    count, densities = np.unique(unit, return_counts=True)[1], []
+    count, densities, squares, scales = np.unique(unit, return_counts=True)[1], [], [], []
     for rows, residual, free, noise in (before, after):
-        density = _predictions(rows, residual, unit, free)[:, 0]
-        densities.append(density - count * free / len(unit) * np.log(noise))
-    return densities[1] - densities[0]
+        predicted = _predictions(rows, residual, unit, free)
+        densities.append(predicted.density - count * free / len(unit) * np.log(noise))
+        squares.append(predicted.square * noise**2)
+        scales.append(predicted.scale * noise**2)
+    return np.stack([densities[1] - densities[0], 0.5 * (squares[0] - squares[1]) / min(scales)])
+
+
+class _Predicted(NamedTuple):
+    """Units of data rows as all the others predict them: ln p, χ² in units of the stated errors, squared distance.
+
+    `scale` is the χ²/dof that the model leaves, 1 or more.
+    """
+
+    density: Float[np.ndarray, " u"]
+    square: Float[np.ndarray, " u"]
+    distance: Float[np.ndarray, " u"]
+    scale: float
 
 
 def _predictions(
     rows: Float[np.ndarray, "r n"], residual: Float[np.ndarray, " r"], unit: np.ndarray, free: int
-) -> Float[np.ndarray, "u 2"]:
-    """ln p of the data rows of each unit as all the others predict them, and the square of how far they are off.
-
-    Rows beyond those of `unit` are priors.
-    """
+) -> _Predicted:
+    """The units; rows beyond those of `unit` are priors."""
     norm = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norm > 0, norm, 1.0)
     ridge = 1e-12 * np.eye(len(norm))
@@ -327,5 +351,6 @@ def _predictions(
         square = d @ d - pull @ np.linalg.solve(gram, pull)
         spread = log_determinant - np.linalg.slogdet(remaining)[1]
         density = -0.5 * (square / scale + spread + len(r) * free / len(unit) * np.log(scale))
-        predictions.append((density, float(d @ d)))
-    return np.array(predictions)
+        predictions.append((density, square, d @ d))
+    density, square, distance = np.array(predictions).T
+    return _Predicted(density, square, distance, scale)
