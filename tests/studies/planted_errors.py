@@ -98,8 +98,10 @@ ERRORS = (
             "model/effects/test_effects_of_light.py"),
     planted("model/effects/blemish.py", "(2.0 * spot.size**2)", "spot.size**2",
             "model/effects/test_effects_of_cameras.py"),
-    planted("model/effects/cameras.py", "in_exposures(change, exposures)[:, None]",
-            "in_exposures(change, exposures)[:, None] / 24.0", "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/cameras.py", "jnp.asarray(pattern, float)[..., None]",
+            "jnp.asarray(pattern, float)[..., None] / 24.0", "model/effects/test_effects_of_cameras.py"),
+    planted("model/effects/cameras.py", "else change.factor(AtPoint(x, y))", "else change.factor(AtPoint(y, x))",
+            "model/effects/test_effects_of_cameras.py"),
     # likelihood, covariance, degrees of freedom, engine
     planted("likelihood/flux.py", "return flux, weighted_counts - flux * weighted_model",
             "return flux, weighted_counts - best * weighted_model", *_LIKELIHOOD),
@@ -160,6 +162,8 @@ ERRORS = (
     planted("science/polarisation.py", "np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)",
             "np.mod(np.rad2deg(0.5 * np.arctan2(q, u)), 180.0)", "science/test_polarisation.py"),
     # diagnosis
+    planted("diagnosis/refits.py", "0.5 * (squares[0] - squares[1])", "0.5 * (squares[1] - squares[0])",
+            "diagnosis/test_kinds_predict.py"),
     planted("diagnosis/score.py", "amplitudes=-w @ z", "amplitudes=w @ z", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "jacobian.shape[0] - jacobian.shape[1] - eliminated",
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
