@@ -287,9 +287,8 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
     """χ² of the set with X corrected, fitted, is smaller by the score, to the order of the step squared."""
     calset = simulate(SMALL, seed=SEED).calset
     wrong, right = refit(displaced(calset)), refit(calset)
-    score = next(
-        s for one, s, *_ in condition_scores(Design.of(wrong)) if one.what.startswith("X of all field points")
-    )
+    scored = condition_scores(Design.of(wrong))
+    score = next(item.score for one, item in scored if one.what.startswith("X of all field points"))
     away = float(score.amplitudes[0]) - -0.02
     expected = score.statistic - away**2 / score.covariance[0, 0]
     assert wrong.chi2 - right.chi2 == pytest.approx(expected, rel=0.1)
@@ -340,13 +339,13 @@ def test_at_its_limit_a_number_is_found_as_often_as_promised():
     noise[:rows] = rng.standard_normal((rows, noise.shape[1]))
     checked = 0
     scored = condition_scores(design)
-    tried = sum(one.score.testable for one in scored)
+    tried = sum(item.score.testable for _, item in scored)
     least = 1.0 - (1.0 - 0.0027) ** (1.0 / tried)
-    for stated, score, column, _ in scored:
+    for stated, item in scored:
         limit = limits[stated.what]
-        if not score.testable:
+        if not item.score.testable:
             continue
-        left = design.projector(column)
+        left = design.projector(item.single.candidate.columns[:, 0])
         along = left @ design.projector(noise) / np.linalg.norm(left)
         for share, expected in ((1.0, thresholds.PROBABILITY), (0.5, 0.5)):
             size = share * limit.detected * np.linalg.norm(left)

@@ -151,4 +151,5 @@ def test_what_an_effect_does_to_starlight_is_that_of_the_light_path(name):
         points = fit.calset.points
         at = of_stars.setting, fit.calset.filters, points.x, points.y
         exact = change_by_effect(of_stars.instrument, one.effect, *at)
-        np.testing.assert_allclose(one.change, exact, atol=0.05 * np.abs(exact).max())
+        atol = 0.05 * np.abs(exact).max()
+        np.testing.assert_allclose(one.change, exact[of_stars.places], atol=atol)

@@ -50,7 +50,7 @@ def main() -> None:
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     design, rng, found = Design.of(small_fit()), np.random.default_rng(given.seed), Counter[str]()
-    rivals = Singles.of(design).rivals
+    rivals = [item.single for item in Singles.of(design).items]
     for number in range(given.draws):
         drawn = dataclasses.replace(design, residual=noise(design, rng))
         drawn.__dict__["projector"] = design.projector

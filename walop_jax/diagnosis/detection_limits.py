@@ -472,19 +472,19 @@ def _collected(
 def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     """A limit for every stated condition of the set behind a fit."""
     scored = condition_scores(design)
-    tried = sum(item.score.testable for item in scored)
+    tried = sum(item.score.testable for _, item in scored)
     if not tried:
         return ()
     result = design.fit
     instrument, calset = result.model.instrument(result.values), result.calset
     setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
-    columns = np.column_stack([item.column for item in scored])
+    columns = np.column_stack([item.single.candidate.columns[:, 0] for _, item in scored])
     taken_up = design.projector.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
     limits = []
-    for number, (stated, score, _, square) in enumerate(scored):
+    for number, (stated, item) in enumerate(scored):
         slope = off[..., number]
         if stated.seen_by_stars:
             step = STEP * stated.width
@@ -493,7 +493,7 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
             )
             slope = slope - (above - below) / (2.0 * step)
         # Of errors as stated, not of the residuals: a plan has none.
-        detected = float(np.sqrt(least / square)) if score.testable else np.inf
+        detected = float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
         size = min(detected, stated.width)
         error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
         limits.append(ConditionLimit(stated.what, stated.unit, detected, size, error))

@@ -44,7 +44,7 @@ class _Mistake(NamedTuple):
     """One number at its largest undetected size, and its projection on the parameters.
 
     `informed`: whether the data hold information on it. Of an effect, at its size, `change` is what it does to the
-    instrument matrix at the field points, and it `acts` on starlight if it does anything.
+    instrument matrix where the errors of stars are computed, and it `acts` on starlight if it does anything anywhere.
     """
 
     name: str
@@ -67,13 +67,12 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     size does little to stars, which see what the polariser sees: it stays if it does half of what the worst does.
     """
     fit = design.fit
-    usual = usual_exposure(fit.calset, fit.model.template)
-    instrument = fit.model.instrument(fit.values)
-    mistakes = list(_mistakes(design, singles, usual))
+    of_stars = _Starlight(design, singles.asked, usual_exposure(fit.calset, fit.model.template))
+    instrument, mistakes = of_stars.instrument, list(_mistakes(singles, of_stars))
     along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.projector.taken_up(along)).T
     turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
-    errors = _errors_of_stars(design, mistakes, changes, usual) + 2.0 * LARGEST_P * turns
+    errors = of_stars.errors(mistakes, changes) + 2.0 * LARGEST_P * turns
     least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
@@ -104,42 +103,39 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     )
 
 
-def _mistakes(design: Design, singles: Singles, usual: int) -> Iterator[_Mistake]:
+def _mistakes(singles: Singles, of_stars: _Starlight) -> Iterator[_Mistake]:
     """All of them, amplitude by amplitude."""
-    of_stars = _Starlight(design, singles.asked, usual)
-    p, first = local_p(thresholds.ALARM, len(singles.testable)), 0
-    shown = set()
-    for rival in singles.rivals:
-        count = len(rival.candidate.widths)
-        at = slice(first, first + count)
-        first += count
-        plausible, alive = np.broadcast_to(rival.plausible, count), singles.alive[at]
+    p, shown = local_p(thresholds.ALARM, len(singles.testable)), set[str]()
+    for single, score, along, rest, alive in singles.items:
+        plausible = np.broadcast_to(single.plausible, len(rest))
         if not plausible.any():
             continue
-        least = noncentrality(p, max(singles.table[rival.candidate.name].rank, 1), thresholds.PROBABILITY)
-        information = np.where(alive, singles.left[at], 1.0)
+        least = noncentrality(p, max(score.rank, 1), thresholds.PROBABILITY)
+        information = np.where(alive, rest, 1.0)
         sizes = np.where(alive, np.minimum(plausible, np.sqrt(least / information)), plausible)
-        along = singles.along[:, at] * sizes
-        if rival.probe is not None:
-            shown.add(rival.probe.name)
-            yield from of_stars.effects(rival.probe, sizes, along, alive)
+        along = along * sizes
+        if single.probe is not None:
+            shown.add(single.probe.name)
+            yield from of_stars.effects(single.probe, sizes, along, alive)
         else:
-            kind, size = EFFECT if rival.stated is None else DATA, float(sizes[0])
-            number = rival.candidate.name, kind, size, rival.unit, rival.shown_by
+            kind, size = EFFECT if single.stated is None else DATA, float(sizes[0])
+            number = score.name, kind, size, single.unit, single.shown_by
             yield _Mistake(*number, along[:, 0], bool(alive[0]))
     for probe in (probe for probe in of_stars.asked if probe.name not in shown):
-        nothing, alive = np.zeros((len(singles.along), len(probe.widths))), np.zeros(len(probe.widths), bool)
-        yield from of_stars.effects(probe, probe.widths, nothing, alive)
+        count = len(probe.widths)
+        nothing = np.zeros((of_stars.parameters, count))
+        yield from of_stars.effects(probe, probe.widths, nothing, np.zeros(count, bool))
 
 
 class _Starlight:
     """Change of starlight by the effects that are asked, in the setting of an exposure."""
 
     def __init__(self, design: Design, asked: Sequence[Probe], exposure: int) -> None:
-        self.fit, self.asked = design.fit, asked
+        self.fit, self.asked, self.parameters = design.fit, asked, design.projector.basis.shape[1]
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
+        self.places = np.unique(np.linspace(0, len(calset.points) - 1, STAR_POINTS).astype(int))
         every = {p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked}
         linear = {
             name: terms for name, terms in every.items() if terms and all(map(design.columns.has, terms))
@@ -169,7 +165,23 @@ class _Starlight:
             size, unit = float(sizes[number]), declared[parameter].unit
             number_of = (f"{probe.effect.name}.{parameter}", EFFECT, size, unit, probe.effect.revealed_by)
             acts = bool(np.abs(added).max(initial=0.0) > thresholds.ROUNDING)
-            yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
+            informed, change = bool(alive[number]), change[self.places]
+            yield _Mistake(*number_of, along[:, number], informed, effect, change, acts)
+
+    def errors(
+        self, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"]
+    ) -> Float[np.ndarray, " c"]:
+        """Median error of q and u over some field points from each mistake; 0 where these are not measured.
+
+        `changes` are those of the parameters.
+        """
+        calset, errors = self.fit.calset, np.zeros(len(mistakes))
+        x, y = calset.points.x[self.places], calset.points.y[self.places]
+        matrix, slopes = matrix_slopes(self.instrument, self.setting, calset.filters, x, y)
+        for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
+            error = change_of_qu(matrix, matrix + (mistake.change - slopes @ moved))
+            errors[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
+        return errors
 
 
 def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
@@ -187,25 +199,3 @@ def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:
     """The exposure in the most usual setting: the first of those with fewest moving elements in the beam."""
     inside = [calset.exposures.position(prefix).inside for prefix in instrument.patched().moving()]
     return int(np.argmin(np.sum(inside, axis=0))) if inside else 0
-
-
-def _errors_of_stars(
-    design: Design, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"], exposure: int
-) -> Float[np.ndarray, " c"]:
-    """Median error of q and u over some field points from each mistake; 0 where these are not measured."""
-    fit, points = design.fit, design.fit.calset.points
-    places = np.unique(np.linspace(0, len(points) - 1, STAR_POINTS).astype(int))
-    instrument = fit.model.instrument(fit.values)
-    at = (
-        first_setting(fit.calset, instrument, exposure),
-        fit.calset.filters,
-        points.x[places],
-        points.y[places],
-    )
-    matrix, slopes = matrix_slopes(instrument, *at)
-    errors = np.zeros(len(mistakes))
-    for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
-        direct = mistake.change[places] if isinstance(mistake.change, np.ndarray) else mistake.change
-        error = change_of_qu(matrix, matrix + (direct - slopes @ moved))
-        errors[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
-    return errors

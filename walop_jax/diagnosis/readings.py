@@ -22,11 +22,12 @@ import dataclasses
 import itertools
 import operator
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from walop_jax.data.kinds import POLARISER
-from walop_jax.data.records import Block, CalibrationSet, Exposures, Points, Position
+from walop_jax.data.records import Block, CalibrationSet, Exposures, Points, Position, Sources
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.fit.base_model import base_model, model_like
@@ -177,7 +178,7 @@ def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
         yield Alternative(
             "the calibration polariser was not in the beam",
             "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
-            with_exposures(lambda e: e.placed(**{POLARISER: Position.out(len(e))})),
+            with_part("exposures", lambda e: e.placed(**{POLARISER: Position.out(len(e))})),
         )
 
 
@@ -289,27 +290,26 @@ def _exchanged(calset: CalibrationSet, pair: tuple[int, int]) -> CalibrationSet:
     return dataclasses.replace(calset, exposures=swapped)
 
 
+def with_part(part: str, change: Callable[[Any], Any]) -> Change:
+    """A set with another of its parts: its exposures, sources or site."""
+    return lambda calset: dataclasses.replace(calset, **{part: change(getattr(calset, part))})
+
+
+def with_values(part: str, name: str, turn: Callable[[Any], Any]) -> Change:
+    """A set with other values of one name in a part of it."""
+    return with_part(part, lambda old: dataclasses.replace(old, **{name: turn(getattr(old, name))}))
+
+
+def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return with_values("exposures", column, turn)
+
+
 def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
-    def change(calset: CalibrationSet) -> CalibrationSet:
-        q, u = turn(calset.sources.q, calset.sources.u)
-        return dataclasses.replace(calset, sources=dataclasses.replace(calset.sources, q=q, u=u))
+    def change(old: Sources) -> Sources:
+        q, u = turn(old.q, old.u)
+        return dataclasses.replace(old, q=q, u=u)
 
-    return change
-
-
-def with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """A set with another column of its exposures."""
-    return with_exposures(lambda e: dataclasses.replace(e, **{column: turn(getattr(e, column))}))
-
-
-def with_site(name: str, turn: Callable[[float], float]) -> Change:
-    """A set with another longitude or latitude of the site."""
-
-    def change(calset: CalibrationSet) -> CalibrationSet:
-        site = dataclasses.replace(calset.site, **{name: turn(float(getattr(calset.site, name)))})
-        return dataclasses.replace(calset, site=site)
-
-    return change
+    return with_part("sources", change)
 
 
 def _has_stars(calset: CalibrationSet, worst: Exposures) -> bool:
@@ -414,15 +414,9 @@ def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
 
 
 def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Change:
-    def change(e: Exposures) -> Exposures:
-        return e.placed(**{prefix: Position.at(turned(e.position(prefix).angle))})
-
-    return with_exposures(change)
-
-
-def with_exposures(change: Callable[[Exposures], Exposures]) -> Change:
-    """A set with other exposures."""
-    return lambda calset: dataclasses.replace(calset, exposures=change(calset.exposures))
+    return with_part(
+        "exposures", lambda e: e.placed(**{prefix: Position.at(turned(e.position(prefix).angle))})
+    )
 
 
 _AT = "give degrees, or the unit of the column"
@@ -434,22 +428,22 @@ _TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Chang
     ("Q and U of SOURCES are in per cent", "give fractions", _has_stars,
      _with_sources(lambda q, u: (q / 100.0, u / 100.0))),
     ("ROTATOR runs the other way", "correct it (docs: conventions)", _has_rotator,
-     with_column("rotator", operator.neg)),
+     _with_column("rotator", operator.neg)),
     ("ROTATOR is 90° too small", "correct it (docs: conventions)", _has_rotator,
-     with_column("rotator", lambda a: a + 90.0)),
-    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, with_column("rotator", np.rad2deg)),
-    ("RA is in hours", _AT, _below("ra", 24.0), with_column("ra", lambda a: 15.0 * a)),
-    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), with_column("ra", np.rad2deg)),
-    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), with_column("dec", np.rad2deg)),
+     _with_column("rotator", lambda a: a + 90.0)),
+    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, _with_column("rotator", np.rad2deg)),
+    ("RA is in hours", _AT, _below("ra", 24.0), _with_column("ra", lambda a: 15.0 * a)),
+    ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), _with_column("ra", np.rad2deg)),
+    ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), _with_column("dec", np.rad2deg)),
     ("RA and DEC are exchanged", "exchange them", _below("ra", 90.0),
-     with_exposures(lambda e: dataclasses.replace(e, ra=np.mod(e.dec, 360.0), dec=e.ra))),
-    ("DEC has the other sign", "give −DEC", _has_moon, with_column("dec", operator.neg)),
+     with_part("exposures", lambda e: dataclasses.replace(e, ra=np.mod(e.dec, 360.0), dec=e.ra))),
+    ("DEC has the other sign", "give −DEC", _has_moon, _with_column("dec", operator.neg)),
     *(
         (f"MJD is {abs(days):g} d too {'large' if days > 0 else 'small'}",
-         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, with_column("mjd", lambda t, d=days: t - d))
+         "give MJD = JD − 2400000.5, UTC at mid-exposure", _has_moon, _with_column("mjd", lambda t, d=days: t - d))
         for days in (0.5, -0.5, 1.0, -1.0)
     ),
-    ("SITELONG has the other sign", "east is positive", _has_moon, with_site("longitude", operator.neg)),
-    ("SITELAT has the other sign", "north is positive", _has_moon, with_site("latitude", operator.neg)),
+    ("SITELONG has the other sign", "east is positive", _has_moon, with_values("site", "longitude", operator.neg)),
+    ("SITELAT has the other sign", "north is positive", _has_moon, with_values("site", "latitude", operator.neg)),
 )  # fmt: skip
 """Readings of sky and standards: what must have happened, what to do, the sets it can have happened to, the cure."""

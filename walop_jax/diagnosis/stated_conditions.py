@@ -35,8 +35,8 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes
-from walop_jax.diagnosis.readings import with_column, with_places, with_site
-from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, corrected_p
+from walop_jax.diagnosis.readings import with_places, with_values
+from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.flux import project_flux
@@ -54,7 +54,7 @@ _PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capit
 STEP = 1e-4  # of the width: the error of the derivative is its square
 
 
-class _Stated(NamedTuple):
+class Stated(NamedTuple):
     """A number that a set states: what it is, its unit, what to check, what would measure it, the set with it changed.
 
     `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
@@ -73,19 +73,7 @@ class _Stated(NamedTuple):
     along: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None
 
 
-class ScoredNumber(NamedTuple):
-    """A number, the score of changing it, and the derivative of the residuals (rows of the design).
-
-    `square` is the square of the residual of the derivative: information, in errors as stated.
-    """
-
-    stated: _Stated
-    score: Score
-    column: Float[np.ndarray, " _"]
-    square: float
-
-
-class _Single(NamedTuple):
+class Single(NamedTuple):
     """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
 
     `plausible` is the largest mistake to reckon with where the data would not show it, of each number; 0 where errors
@@ -98,23 +86,33 @@ class _Single(NamedTuple):
     plausible: float | Float[np.ndarray, " _"] = 0.0
     unit: str = ""
     shown_by: str = ""
-    stated: _Stated | None = None
+    stated: Stated | None = None
     probe: Probe | None = None
+
+
+class Scored(NamedTuple):
+    """A number, or a few of one thing, with the score of changing it.
+
+    `along` (q, columns) is what the parameters take up of its columns, Qᵀ C; `rest` the square of what they leave:
+    information, in errors as stated, where it is `alive`.
+    """
+
+    single: Single
+    score: Score
+    along: Float[np.ndarray, "q c"]
+    rest: Float[np.ndarray, " c"]
+    alive: Bool[np.ndarray, " c"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Singles:
-    """All single numbers of a fit with their scores.
+    """All single numbers of a fit with their scores; `noise_scale` is that of the scores.
 
-    `along` (q, columns) is what the parameters take up of their columns, Qᵀ C; `left` the square of what they leave,
-    `alive` where that is information on them. `asked` are the effects among them, and those that the set cannot show.
+    `asked` are the effects among them, and those that the set cannot show.
     """
 
-    rivals: tuple[_Single, ...]
-    table: ScoreTable
-    along: Float[np.ndarray, "q c"]
-    left: Float[np.ndarray, " c"]
-    alive: Bool[np.ndarray, " c"]
+    items: tuple[Scored, ...] = ()
+    noise_scale: float = 1.0
     asked: tuple[Probe, ...] = ()
 
     @classmethod
@@ -127,21 +125,26 @@ class Singles:
     @property
     def testable(self) -> list[Score]:
         """The scores of those of which the parameters leave something."""
-        return [score for score in self.table.scores if score.testable]
+        return [item.score for item in self.items if item.score.testable]
 
 
-def scored(design: Design, rivals: tuple[_Single, ...]) -> Singles:
+def scored(design: Design, rivals: Sequence[Single]) -> Singles:
     """Single numbers with their scores in the residuals of a design."""
-    matrices = [r.candidate.columns for r in rivals]
+    if not rivals:
+        return Singles()
+    matrices = [rival.candidate.columns for rival in rivals]
     columns = np.concatenate([np.zeros((len(design.residual), 0)), *matrices], axis=1)
     along = design.projector.basis.T @ columns
-    if not rivals:
-        return Singles((), ScoreTable((), 1.0, 1.0, 1.0), along, np.zeros(0), np.zeros(0, bool))
     names, widths = zip(*((r.candidate.name, r.candidate.widths) for r in rivals), strict=True)
     space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
-    return Singles(rivals, table, along, np.diag(space.gram), space.alive)
+    rest, places = np.diag(space.gram), space.places().values()
+    items = (
+        Scored(rival, score, along[:, at], rest[at], space.alive[at])
+        for rival, score, at in zip(rivals, table.scores, places, strict=True)
+    )
+    return Singles(tuple(items), table.noise_scale)
 
 
 def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
@@ -150,21 +153,21 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     Of a fit that does not explain its data only where one of them alone would.
     """
     singles = singles or Singles.of(design)
-    rivals, table, scores = singles.rivals, singles.table, singles.testable
+    scores = singles.testable
     clear = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
     if not clear:
         return
     clear.sort(key=lambda score: score.log_p)
     best, result = clear[0], design.fit
     square = float(np.sum(design.projector(design.residual) ** 2))
-    rest = square - best.statistic * table.noise_scale**2
+    rest = square - best.statistic * singles.noise_scale**2
     if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
     likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - ALIKE]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
     likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
-    wordings = {item.candidate.name: item.worded for item in rivals}
+    wordings = {item.single.candidate.name: item.single.worded for item in singles.items}
     causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(scores))
@@ -178,7 +181,7 @@ def _holds(score: Score, rival: Score) -> bool:
     return score.name.startswith(f"{rival.name}.") and rival.log_p < score.log_p
 
 
-def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
+def _conditions(design: Design, what: str = "") -> Iterator[Single]:
     """The numbers that the set states and that are used, or the one that is `what`."""
     statements = [item for item in _stated(design.fit.calset) if what in ("", item.what)]
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
@@ -189,10 +192,10 @@ def _conditions(design: Design, what: str = "") -> Iterator[_Single]:
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if item.seen_by_stars else item.width
         wording = functools.partial(condition_in_words, item)
-        yield _Single(candidate, wording, plausible, item.unit, item.shown_by, item)
+        yield Single(candidate, wording, plausible, item.unit, item.shown_by, item)
 
 
-def _priors(design: Design) -> Iterator[_Single]:
+def _priors(design: Design) -> Iterator[Single]:
     """The prior of every free parameter, and those of all numbers of an element, as what may be wrong."""
     rows, parameters = design.fit.likelihood.priors, design.fit.model.parameters
     constrained = np.flatnonzero(rows.known).tolist()
@@ -213,10 +216,10 @@ def _priors(design: Design) -> Iterator[_Single]:
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))
         columns[design.rows + np.array(members), np.arange(len(members))] = 1.0
-        yield _Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), wording)
+        yield Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), wording)
 
 
-def _of_cameras(design: Design) -> Iterator[_Single]:
+def _of_cameras(design: Design) -> Iterator[Single]:
     """Mistakes of a single camera in its counts with one amplitude: closed forms of the counts themselves."""
     measured, names = design.measured, design.fit.model.template.cameras.names
     counts = measured.flux[..., None] * measured.model / np.where(measured.weight > 0, measured.weight, 1.0)
@@ -225,14 +228,14 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
     median[exposed] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, exposed], axis=0)
     typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
-    def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> _Single:
+    def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
         column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
         rows = design.stacked([-column[measured.used].reshape(-1, 1)])
         name = words.format(names[k])
         wording = functools.partial(_worded, f"{name} of", unit=unit)
-        return _Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
+        return Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
 
     if not measured.used.any():
         return
@@ -250,22 +253,20 @@ def _of_cameras(design: Design) -> Iterator[_Single]:
 def _asked_effects(design: Design) -> tuple[Probe, ...]:
     """Probes of effects that the model has not; those with a place or a gap of their own are left to the patterns."""
     fit, template = design.fit, design.fit.model.template
-    context, excluded = (
-        effect_context(template, fit.calset.exposures),
-        (*fit.model.effect_names, *_ASKED_OTHERWISE),
-    )
+    context = effect_context(template, fit.calset.exposures)
+    excluded = {*fit.model.effect_names, *_ASKED_OTHERWISE}
     asked = (kind for kind in fit.model.catalogue if not set(kind.shape) & _PLACES)
     kinds = [kind for kind in asked if kind.name not in excluded]
     return tuple(probes(applicable(kinds, context, template), context))
 
 
-def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[_Single]:
+def _of_catalogue(design: Design, effects: Sequence[Probe]) -> Iterator[Single]:
     """The effects that are asked, as far as the set can show them."""
     named = all_candidates(design.columns, effects)
     for probe in (probe for probe in effects if probe.name in named):
         candidate = Candidate(probe.name, design.stacked([named[probe.name].columns]), probe.widths)
         wording = functools.partial(_effect_in_words, probe, design.fit.model.template.cameras.names)
-        yield _Single(candidate, wording, probe.widths, "", probe.effect.revealed_by, None, probe)
+        yield Single(candidate, wording, probe.widths, probe=probe)
 
 
 def _effect_in_words(probe: Probe, cameras: Sequence[str], score: Score) -> str:
@@ -289,7 +290,7 @@ def _worded(
     return f"{what} {with_error(start + float(score.amplitudes[number]) * width, sigma)} {unit}".rstrip()
 
 
-def condition_in_words(stated: _Stated, score: Score) -> str:
+def condition_in_words(stated: Stated, score: Score) -> str:
     """A number that the set states, with its score, and what to check."""
     if stated.value is None:
         return f"{_worded(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
@@ -297,17 +298,13 @@ def condition_in_words(stated: _Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design, what: str = "") -> list[ScoredNumber]:
+def condition_scores(design: Design, what: str = "") -> list[tuple[Stated, Scored]]:
     """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
-    singles = scored(design, tuple(_conditions(design, what)))
-    return [
-        ScoredNumber(r.stated, singles.table[r.candidate.name], r.candidate.columns[:, 0], float(info))
-        for r, info in zip(singles.rivals, singles.left, strict=True)
-        if r.stated is not None
-    ]
+    items = scored(design, tuple(_conditions(design, what))).items
+    return [(item.single.stated, item) for item in items if item.single.stated is not None]
 
 
-def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np.ndarray, " _"]]:
+def _columns(design: Design, statements: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:
     of_field = [item for item in statements if item.along is not None]
     by_place = [_column(design, item) for item in of_field[:2] if len(of_field) > 2]  # X and Y come first
     for item in statements:
@@ -318,7 +315,7 @@ def _columns(design: Design, statements: Sequence[_Stated]) -> Iterator[Float[np
             yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
-def _column(design: Design, statement: _Stated) -> np.ndarray:
+def _column(design: Design, statement: Stated) -> np.ndarray:
     def residual(step: float) -> np.ndarray:
         likelihood = Likelihood.of(statement.changed(step), design.fit.model)
         return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
@@ -329,14 +326,14 @@ def _column(design: Design, statement: _Stated) -> np.ndarray:
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
-def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
+def _stated(calset: CalibrationSet) -> Iterator[Stated]:
     if len(calset.points) > 1:
         yield from _of_field(calset)
     for name in calset.filters:
         remedy = "check its curve, and what the polariser exposures were taken through"
         moved = functools.partial(_with_wavelength, calset, name)
         what, shown_by = f"the wavelengths of filter {name}", "a measured curve of the filter"
-        yield _Stated(what, "um", remedy, shown_by, 0.05, moved, seen_by_stars=True)
+        yield Stated(what, "um", remedy, shown_by, 0.05, moved, seen_by_stars=True)
     e = calset.exposures
     for kind in np.unique(e.kind):
         chosen = (e.kind == kind) & np.isfinite(e.teff)
@@ -345,7 +342,7 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             warmer = functools.partial(_moved, calset, chosen, "teff", e.teff / typical)
             stated = typical if np.ptp(e.teff[chosen]) == 0.0 else None
             what = f"TEFF of exposures of kind {kind}"
-            yield _Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
+            yield Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
     yield from _of_sky(calset)
     table = calset.intensities
     if isinstance(table, TableIntensities) and (sky := table.sky) is not None and sky.any():
@@ -355,17 +352,17 @@ def _stated(calset: CalibrationSet) -> Iterator[_Stated]:
             return dataclasses.replace(calset, intensities=dataclasses.replace(table, counts=counts))
 
         what, remedy = "the light of the sky that is left, in units of SKY,", "subtract the sky anew"
-        yield _Stated(what, "", remedy, "the same stars under another sky", 0.1, less, 0.0)
+        yield Stated(what, "", remedy, "the same stars under another sky", 0.1, less, 0.0)
 
 
 def _moved(
     calset: CalibrationSet, chosen: np.ndarray, column: str, by: float | np.ndarray, step: float
 ) -> CalibrationSet:
     """The set with a multiple of something added to a column of some of its exposures."""
-    return with_column(column, lambda values: np.where(chosen, values + step * by, values))(calset)
+    return with_values("exposures", column, lambda old: np.where(chosen, old + step * by, old))(calset)
 
 
-def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
+def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
     """Mistakes in the place and the time of the sky, as the exposures and the site state them."""
     e, site = calset.exposures, calset.site
     moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
@@ -380,7 +377,7 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
 
         remedy = "they are to be ICRS, not coordinates of date"
         solved = "an astrometric solution of frames of the same fields"
-        yield _Stated("the equinox of RA and DEC", "", remedy, solved, 100.0, of_date, 2000.0)
+        yield Stated("the equinox of RA and DEC", "", remedy, solved, 100.0, of_date, 2000.0)
         at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
         when = "check the clock and the time zone: UTC at mid-exposure"
         for name, unit, width, remedy, shown_by in (
@@ -389,26 +386,26 @@ def _of_sky(calset: CalibrationSet) -> Iterator[_Stated]:
             ("MJD", "d", 1.0, when, "a clock that is compared with UTC"),
         ):
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
-            yield _Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
+            yield Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
             elsewhere = functools.partial(_at_site, calset, name)
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
             value = float(getattr(site, name))
-            yield _Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, value)
+            yield Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, value)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
         shown_by = "polarised standards at several ROTATOR angles"
-        yield _Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, shown_by, 45.0, moved)
+        yield Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, shown_by, 45.0, moved)
 
 
 def _at_site(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
     """The set with a site farther in longitude or latitude, up to the pole."""
     limit = 90.0 if name == "latitude" else np.inf
-    return with_site(name, lambda value: float(np.clip(value + step, -limit, limit)))(calset)
+    return with_values("site", name, lambda value: float(np.clip(value + step, -limit, limit)))(calset)
 
 
-def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
+def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
     check = "check X and Y against the frames (docs: conventions)"
     solved = "an independent check of the field positions"
     x, y = calset.points.x, calset.points.y
@@ -420,7 +417,7 @@ def _of_field(calset: CalibrationSet) -> Iterator[_Stated]:
         ("the angle of the field", "rad", 1.0, (-y, x)),
     ):
         moved = functools.partial(_displaced, calset, along)
-        yield _Stated(what, unit, check, solved, width, moved, along=along)
+        yield Stated(what, unit, check, solved, width, moved, along=along)
 
 
 def _displaced(calset: CalibrationSet, along: tuple[np.ndarray, np.ndarray], step: float) -> CalibrationSet:

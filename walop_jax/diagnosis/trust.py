@@ -144,9 +144,8 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     fit, calset, basis, count = design.fit, design.fit.calset, design.projector.basis, design.rows
     listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
     probes = listed.beside(fit.model.effect_names)
-    known = {
-        r.candidate.name: r.candidate.columns[:count] for r in (singles.rivals if singles else ()) if r.probe
-    }
+    numbers = (item.single for item in (singles.items if singles else ()))
+    known = {n.candidate.name: n.candidate.columns[:count] for n in numbers if n.probe}
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
