@@ -18,7 +18,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.verdict import Quality
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Described
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
@@ -41,17 +41,16 @@ def examined() -> Examination:
 
 
 @functools.cache
-def told() -> tuple[FitResult, Context, Any]:
-    """That fit, the context, and the class of the description."""
+def told() -> tuple[FitResult, Any]:
+    """That fit, and the class of the description."""
     result = examined().result
-    context = effect_context(result.model.template, result.calset.exposures)
-    return result, context, ambiguities(examined(), context, {TOLD: ()})
+    return result, ambiguities(examined(), {TOLD: ()})
 
 
 @functools.cache
 def diagnosed() -> Diagnosis:
     """The diagnosis that has found that class, nothing searched for."""
-    result, _, classes = told()
+    result, classes = told()
     after = result.judged()
     for sentence in only_a_class(classes):
         after = after.doubted(Quality.CLASS_ONLY, sentence)

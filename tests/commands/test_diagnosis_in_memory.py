@@ -21,8 +21,8 @@ X, Y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
 @pytest.fixture(scope="module")
 def product() -> Calibration:
     """The mean over the class, made here of the plain fit."""
-    result, context, classes = told()
-    return averaged(Calibration.from_fit(result.judged()), classes, context)
+    result, classes = told()
+    return averaged(Calibration.from_fit(result.judged()), classes)
 
 
 @pytest.fixture(params=["diagnosis", "its last fit"])

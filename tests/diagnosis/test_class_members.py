@@ -37,7 +37,7 @@ def told():
 
 
 def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
-    result, _, classes = told
+    result, classes = told
     (found,) = classes.additions
     names = [member.name for member in found.members]
     assert names[0] == TOLD
@@ -50,9 +50,9 @@ def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
 
 
 def test_the_product_lies_between_and_its_errors_hold_both(told):
-    result, context, classes = told
+    result, classes = told
     alone = Calibration.from_fit(result.judged())
-    product = averaged(alone, classes, context)
+    product = averaged(alone, classes)
     x, y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
     (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
     shift = 0.5 * (1 - one[:, 0] ** 2) * 3e-3
@@ -66,9 +66,9 @@ def test_the_product_lies_between_and_its_errors_hold_both(told):
 
 def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):
     """Two ways to the same numbers: the model with all members, and the change of the matrix by each."""
-    result, context, classes = told
+    result, classes = told
     alone = Calibration.from_fit(result.judged())
-    product = averaged(alone, classes, context)
+    product = averaged(alone, classes)
     at = result.calset.points.x, result.calset.points.y
     change = (product.matrix(*at)[0] - alone.matrix(*at)[0]).reshape(len(at[0]), -1)
     (group,) = classes.additions
@@ -79,8 +79,8 @@ def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):
 
 def test_one_amplitude_of_two_kinds_is_one_parameter(told):
     """The polariser and the standards are wrong by the same: a covariance of both as two would be singular."""
-    result, context, classes = told
-    product = averaged(Calibration.from_fit(result.judged()), classes, context)
+    result, classes = told
+    product = averaged(Calibration.from_fit(result.judged()), classes)
     clp, standard = (f"described.gain_of_O1_*_kind_{kind}" for kind in ("clp", "standard"))
     assert product.model[standard].tie == clp
     values = dict(zip(product.model.names, product.values, strict=True))
@@ -92,9 +92,11 @@ def test_one_amplitude_of_two_kinds_is_one_parameter(told):
 
 def test_sentences_in_a_fixed_ratio_have_one_error(told):
     """Amplitudes a, b: s₁ = a, s₂ = a + b, s₃ = b, s₄ = a. Two of the four are free."""
-    result, context, _ = told
+    result, _ = told
     texts = [f"gain of {camera} * hours" for camera in ("O1", "E1", "O2", "E2")]
-    model = with_effects(base_model(result.calset), [Described.saying(texts, [0.0, 0.0, 0.0, 0.0])], context)
+    model = with_effects(
+        base_model(result.calset), [Described.saying(texts, [0.0, 0.0, 0.0, 0.0])], result.calset
+    )
     new = [model.index(f"described.{text.replace(' ', '_')}") for text in texts]
     amplitudes = np.zeros((len(model.parameters), 2))
     amplitudes[new] = [[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
@@ -105,14 +107,14 @@ def test_sentences_in_a_fixed_ratio_have_one_error(told):
 
 
 def test_a_class_of_one_changes_nothing(told):
-    result, context, _ = told
+    result, _ = told
     alone = Calibration.from_fit(result.judged())
-    assert averaged(alone, Classes(), context) is alone
+    assert averaged(alone, Classes()) is alone
 
 
 def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     """Of three equally probable ones and e^−6.8 of that: all parameters would be smaller by what is left out."""
-    result, context, _ = told
+    result, _ = told
     laid = Laid(class_scene.examined())
     sums = (((1.0, Change.parsed("gain of O1 * hours")),),)
 
@@ -125,12 +127,12 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
 
     monkeypatch.setattr(LinearStep, "candidates", candidates)
     monkeypatch.setattr(LinearStep, "in_other_kinds", lambda step, member, widths: None)
-    (group,) = classes_of(laid, context, {TOLD: ()})
+    (group,) = classes_of(laid, {TOLD: ()})
     assert len(group.members) == 4
     assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
     # What no member changes, the mean does not change: half-wave plates of thousands of µm, for example.
     alone = Calibration.from_fit(result.judged())
-    product = averaged(alone, Classes(additions=(group,)), context)
+    product = averaged(alone, Classes(additions=(group,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     for name, value, of in zip(alone.model.names, alone.values, alone.model.parameters, strict=True):
         if not of.free and of.tie is None:
@@ -149,7 +151,7 @@ def test_what_was_added_is_in_its_class_once():
         if probe.name in (own, other)
     ]
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(sentences=said), np.random.default_rng(0))
-    (found,) = ambiguities(state, context, {own: ()}).additions
+    (found,) = ambiguities(state, {own: ()}).additions
     assert [member.name for member in found.members] == [own, other]
 
 
@@ -168,10 +170,10 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     assert len(said) == 2
     result = fit(Likelihood.of(calset, model))
     state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
-    classes = ambiguities(state, context, {leak: [rival]})
+    classes = ambiguities(state, {leak: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
     alone = Calibration.from_fit(result.judged())
-    product = averaged(alone, classes, context)
+    product = averaged(alone, classes)
     here = [c.matrix(calset.points.x, calset.points.y)[0] for c in (alone, product)]
     np.testing.assert_allclose(here[1], here[0], atol=1e-4)
 
@@ -186,7 +188,7 @@ def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_anot
     asked = grammar.sentences(result.model.template, calset.exposures, len(calset.points))
     probes = Hypotheses(sentences=[probe for probe in asked if probe.name == rival])
     state = examine(result, probes, np.random.default_rng(0))
-    classes = ambiguities(state, context, {"blemish": (), "lens_birefringence": [rival]})
+    classes = ambiguities(state, {"blemish": (), "lens_birefringence": [rival]})
     assert classes.additions == ()
 
 
@@ -203,9 +205,9 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(monkeypatch):
         if probe.name == "gain of O1 * hours"
     ]
     state = examine(result, Hypotheses(sentences=rivals), np.random.default_rng(0))
-    (spots,) = ambiguities(state, context, {"blemish": [p.name for p in rivals]}).additions
+    (spots,) = ambiguities(state, {"blemish": [p.name for p in rivals]}).additions
     assert spots.members[0].probability >= spots.members[1].probability
-    product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)), context)
+    product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     fitted = dict(zip(result.model.names, result.values, strict=True))
     for shape in ("blemish.x", "blemish.y", "blemish.size"):
@@ -224,11 +226,11 @@ def test_what_the_model_has_beside_an_addition_does_not_replace_it():
     probes = Hypotheses(sentences=[probe for probe in asked if probe.name in (first, second)])
     state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
     groups = {first: (second,), second: (first,)}
-    (moon,) = ambiguities(state, context, groups).additions
+    (moon,) = ambiguities(state, groups).additions
     assert [m.name for m in moon.members] == [first, "gain of O1 * kind clp; gain of O1 * kind standard"]
     assert [m.probability for m in moon.members] == pytest.approx([0.5, 0.5])
     # What the model had before is not in question.
-    assert ambiguities(state, context, {second: ()}, given=[first]).additions == ()
+    assert ambiguities(state, {second: ()}, given=[first]).additions == ()
 
 
 def test_a_time_that_is_the_time_of_one_kind_may_be_that_kind():
@@ -245,7 +247,7 @@ def test_a_time_that_is_the_time_of_one_kind_may_be_that_kind():
     asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
     probes = Hypotheses(sentences=[probe for probe in asked if probe.name == "gain of O1 * kind standard"])
     state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
-    (found,) = ambiguities(state, context, {text: ()}).additions
+    (found,) = ambiguities(state, {text: ()}).additions
     assert [m.name for m in found.members] == [text, "gain of O1 * kind clp; gain of O1 * kind moon"]
     assert found.members[1].probability == pytest.approx(0.5, abs=0.05)
 
@@ -261,7 +263,7 @@ def test_the_other_kinds_are_as_probable_whatever_the_size():
         probes = Hypotheses(sentences=[probe for probe in asked if probe.name.startswith("gain of O1")])
         result = settled(fit(Likelihood.of(calset, model)), [Described.name])
         state = examine(result, probes, np.random.default_rng(0))
-        (found,) = ambiguities(state, context, {text: ()}).additions
+        (found,) = ambiguities(state, {text: ()}).additions
         sides = {m.name: m.probability for m in found.members}
         assert sides["gain of O1 * kind clp; gain of O1 * kind moon"] == pytest.approx(sides[text])
 
@@ -269,8 +271,8 @@ def test_the_other_kinds_are_as_probable_whatever_the_size():
 def test_the_product_is_read_as_it_was_written(told, tmp_path):
     from walop_jax.calibration.product import write_calibration
 
-    result, context, classes = told
-    product = averaged(Calibration.from_fit(result.judged()), classes, context)
+    result, classes = told
+    product = averaged(Calibration.from_fit(result.judged()), classes)
     write_calibration(tmp_path / "calibration.fits", product)
     again = Calibration.read(tmp_path / "calibration.fits")
     assert again.content_hash() == dataclasses.replace(product, path=None).content_hash()

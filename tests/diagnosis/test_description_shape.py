@@ -40,7 +40,7 @@ def described():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([TEXT], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    return state, context, ambiguities(state, context, {TEXT: ()})._replace(undetected=None)
+    return state, ambiguities(state, {TEXT: ()})._replace(undetected=None)
 
 
 def test_patterns_are_all_polynomials_to_the_third_degree():
@@ -57,7 +57,7 @@ def test_patterns_are_all_polynomials_to_the_third_degree():
 
 def test_every_kind_may_be_as_large_as_the_description(described):
     """The sum over patterns of width² times the mean square of the factor is (SIZE x)² of the description."""
-    state, _, _ = described
+    state, _ = described
     changes, widths, _ = shape_changes(state.result, state.design.columns)
     points, units = state.result.calset.points, state.result.model.template.units
     amplitude = state.result.values[state.result.model.index(f"described.{TEXT.replace(' ', '_')}")]
@@ -85,7 +85,7 @@ def test_every_kind_may_be_as_large_as_the_description(described):
 )
 def test_a_deviation_changes_the_product_as_the_optics_do(described, text):
     """Error of the matrix beside the change of the matrix by a description of the same words."""
-    state, context, classes = described
+    state, classes = described
     result, shape, size = state.result, classes.shape, 1e-5
     j = [change.text for change in shape.changes].index(text)
     count = len(shape.changes)
@@ -95,7 +95,7 @@ def test_a_deviation_changes_the_product_as_the_optics_do(described, text):
     alone = Calibration.from_fit(result.judged())
     alone = dataclasses.replace(alone, covariance=np.zeros_like(alone.covariance), hidden=None)
     x, y = np.random.default_rng(2).uniform(-0.2, 0.2, (2, 20))
-    product = averaged(alone, classes._replace(shape=shape), context)
+    product = averaged(alone, classes._replace(shape=shape))
     matrix, covariance = product.matrix(x, y)
     errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     instrument = result.model.instrument(result.values)
@@ -109,7 +109,7 @@ def test_a_deviation_changes_the_product_as_the_optics_do(described, text):
 
 
 def test_a_deviation_larger_than_the_errors_is_not_trusted(described):
-    _, _, classes = described
+    _, classes = described
     shape = classes.shape
     assert shape.spread > 0
     assert not list(only_a_class(classes._replace(shape=shape._replace(spread=0.9 * shape.stated))))
@@ -119,8 +119,8 @@ def test_a_deviation_larger_than_the_errors_is_not_trusted(described):
 
 def test_a_new_night_is_fitted_without_the_deviations(described):
     """Hundreds of parameters that act on the optics of every wavelength would take gigabytes, and mean nothing."""
-    state, context, classes = described
-    product = averaged(Calibration.from_fit(state.result.judged()), classes, context)
+    state, classes = described
+    product = averaged(Calibration.from_fit(state.result.judged()), classes)
     assert "deviations" in product.model.effect_names
     held = [p for p in product.model.parameters if p.part == "deviations"]
     assert not any(p.free for p in held)
@@ -189,7 +189,7 @@ def test_deviations_refuse_what_they_do_not_have():
 
 def test_a_new_night_is_fitted_from_the_old_values(described, monkeypatch):
     """Members of a class are much alike: from zero a fit can end in another minimum, with χ²/dof 1.2 for 0.98."""
-    state, _, _ = described
+    state, _ = described
     old = Calibration.from_fit(state.result.judged())
     night, starts = simulate(SMALL, seed=5).calset, []
     monkeypatch.setattr(
@@ -217,10 +217,10 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    classes = ambiguities(state, context, {text: ()})
+    classes = ambiguities(state, {text: ()})
     assert classes.shape.on_stars == ()
     alone = classes._replace(additions=(), undetected=None)
-    product = averaged(Calibration.from_fit(state.result.judged()), alone, context)
+    product = averaged(Calibration.from_fit(state.result.judged()), alone)
     assert "deviations" not in product.model.effect_names
 
 
@@ -233,10 +233,10 @@ def test_deviations_of_sky_light_may_depend_on_the_temperature():
     context = effect_context(base_model(calset).template, calset.exposures)
     model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
     state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
-    classes = ambiguities(state, context, {text: ()})
+    classes = ambiguities(state, {text: ()})
     laws = {change.beside_field for change in classes.shape.changes}
     assert ("kelvin",) in laws
-    product = averaged(Calibration.from_fit(state.result.judged()), classes, context)
+    product = averaged(Calibration.from_fit(state.result.judged()), classes)
     (matrix, covariance), alone = product.matrix(0.1, 0.1), Calibration.from_fit(state.result.judged())
     assert np.all(np.isfinite(matrix))
     assert np.all(np.diag(covariance) >= np.diag(alone.matrix(0.1, 0.1)[1]))

@@ -50,8 +50,7 @@ def sound():
 
 
 def product_of(result, shape) -> Calibration:
-    context = effect_context(result.model.template, result.calset.exposures)
-    return averaged(Calibration.from_fit(result.judged()), Classes(undetected=shape), context)
+    return averaged(Calibration.from_fit(result.judged()), Classes(undetected=shape))
 
 
 def test_second_moments_are_those_of_the_mixture():

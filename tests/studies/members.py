@@ -48,8 +48,8 @@ def judged(seed: int) -> sealed.Judged:
     every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
     state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
-    classes = ambiguities(state, context, {TOLD: ()})
-    return sealed.judged(averaged(Calibration.from_fit(result), classes, context), True, one)
+    classes = ambiguities(state, {TOLD: ()})
+    return sealed.judged(averaged(Calibration.from_fit(result), classes), True, one)
 
 
 def main() -> None:

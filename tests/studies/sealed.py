@@ -69,7 +69,6 @@ from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
-from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
@@ -459,9 +458,8 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
 
 def _with_undetected(fitted: FitResult) -> Calibration:
     """The calibration of a diagnosis that adds nothing to a fit."""
-    context = effect_context(fitted.model.template, fitted.calset.exposures)
     state = examine(fitted, Hypotheses(), np.random.default_rng(0))
-    return Calibration.from_fit(with_average(fitted, ambiguities(state, context, {})))
+    return Calibration.from_fit(with_average(fitted, ambiguities(state, {})))
 
 
 def line(number: int, one: Outcome) -> str:

@@ -36,10 +36,10 @@ from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import sentences_of
 from walop_jax.diagnosis.score import FAINTEST, Matrix, Projector, Vector, log_bayes
-from walop_jax.fit.refit import PRIOR_EDGE, FitResult
+from walop_jax.fit.refit import PRIOR_EDGE
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.specification import effect_context
@@ -51,7 +51,7 @@ PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
-    laid: Laid, context: Context, added: Mapping[str, Collection[str]], given: Collection[str] = ()
+    laid: Laid, added: Mapping[str, Collection[str]], given: Collection[str] = ()
 ) -> tuple[ClassOf, ...]:
     """The classes of what was added to a model, without those of a single member.
 
@@ -61,17 +61,17 @@ def classes_of(
     """
     classes = (
         laid.class_of(words, at, lost, sums, added.get(name, ()))
-        for name, words, at, lost, sums in _additions(laid.fit, context, added, given)
+        for name, words, at, lost, sums in _additions(laid, added, given)
     )
     return tuple(addition for addition in classes if addition.names)
 
 
 def _additions(
-    fit: FitResult, context: Context, added: Collection[str], given: Collection[str]
+    laid: Laid, added: Collection[str], given: Collection[str]
 ) -> Iterator[tuple[str, str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
     """Name as it was added and as it is in the model, positions among the free parameters, change of the data rows
     without it, its amplitudes."""
-    model = fit.model
+    fit, model = laid.fit, laid.fit.model
     groups = [name for name in added if name not in model.effect_names]
     place = {int(i): k for k, i in enumerate(model.free)}
     slope: Matrix | None = None
@@ -79,7 +79,7 @@ def _additions(
         if effect.name in added and not effect.kind.is_structural():
             at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
             if at:
-                change = signature(fit, effect.name, context)
+                change = signature(fit, effect.name, laid.context)
                 sums = tuple(map(tuple, effect.first_order(model.template)))
                 yield effect.name, effect.name, np.array(at), change, sums
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
@@ -130,9 +130,8 @@ class Laid:
         matrix, slopes = matrix_slopes(instrument, *at)
         self.matrix = matrix.reshape(len(matrix), -1)
         self.slopes = slopes.reshape(*self.matrix.shape, -1) @ model.selection()
-        self.errors = np.sqrt(
-            np.einsum("pmf,fg,pmg->pm", self.slopes, covariance_of_free(self.fit), self.slopes)
-        )
+        self.covariance = self.fit.covariance[np.ix_(model.free, model.free)]
+        self.errors = np.sqrt(np.einsum("pmf,fg,pmg->pm", self.slopes, self.covariance, self.slopes))
 
     def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
         """Analysis vectors of a star at the field points, and their derivatives with respect to each amplitude."""
@@ -211,7 +210,7 @@ class Laid:
     @functools.cached_property
     def stated(self) -> float:
         """Error of p of stars from the covariance of the fit."""
-        return self.error_of_p(self.slopes @ covariance_of_free(self.fit) @ np.swapaxes(self.slopes, 1, 2))
+        return self.error_of_p(self.slopes @ self.covariance @ np.swapaxes(self.slopes, 1, 2))
 
     def error_of_p(self, square: Float[np.ndarray, "p m m"]) -> float:
         """Error of p of stars from a covariance of the matrix: median over the field."""
@@ -381,8 +380,3 @@ class LinearStep:
 def _texts(sums: Sequence[Sum]) -> set[str]:
     """The sentences of some amplitudes."""
     return {sentence.text for amplitude in sums for _, sentence in amplitude}
-
-
-def covariance_of_free(fit: FitResult) -> Matrix:
-    """Covariance of the free parameters of a fit."""
-    return fit.covariance[np.ix_(fit.model.free, fit.model.free)]

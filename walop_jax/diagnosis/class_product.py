@@ -140,12 +140,11 @@ def with_average(result: FitResult, classes: Classes) -> FitResult:
     """The fit whose calibration is the mean over the classes of its additions, with all that may be undetected."""
     if not classes:
         return result
-    context = effect_context(result.model.template, result.calset.exposures)
-    mean = functools.partial(averaged, classes=classes, context=context)
+    mean = functools.partial(averaged, classes=classes)
     return dataclasses.replace(result, averaged=mean, mean_of_models=classes.several)
 
 
-def averaged(calibration: Calibration, classes: Classes, context: Context) -> Calibration:
+def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
     Its model includes all members, as sentences, and deviations from the shapes of descriptions; different additions
@@ -153,7 +152,7 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
     """
     if not classes:
         return calibration
-    old, model = calibration.model, _holding(calibration, classes, context)
+    old, model = calibration.model, _holding(calibration, classes)
     parts = [p.part for p in model.parameters]
     new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
     others = [member for addition in classes.additions for member in addition.members[1:]]
@@ -203,7 +202,7 @@ def averaged(calibration: Calibration, classes: Classes, context: Context) -> Ca
     )
 
 
-def _holding(calibration: Calibration, classes: Classes, context: Context) -> Model:
+def _holding(calibration: Calibration, classes: Classes) -> Model:
     """The model with the sentences of all members, and with deviations."""
     texts = dict.fromkeys(
         sentence.text
@@ -213,6 +212,7 @@ def _holding(calibration: Calibration, classes: Classes, context: Context) -> Mo
         for _, sentence in amplitude
     )
     model = calibration.model
+    context = effect_context(model.template, calibration.exposures)
     if (effect := classes.deviations(model, context)) is not None:
         model = with_effects(model, [effect], context)
     if not texts:

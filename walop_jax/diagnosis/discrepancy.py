@@ -49,7 +49,7 @@ from walop_jax.diagnosis.score import SCALES, Matrix, Vector, log_bayes_by_scale
 from walop_jax.fit.refit import FitResult
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import square_root
-from walop_jax.model.effects import Context, Described, FreeForm
+from walop_jax.model.effects import Described, FreeForm
 from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.deviations import CUBIC
@@ -64,10 +64,7 @@ DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in na
 
 
 def ambiguities(
-    state: Examination,
-    context: Context,
-    added: Mapping[str, Collection[str]],
-    given: Collection[str] = (),
+    state: Examination, added: Mapping[str, Collection[str]], given: Collection[str] = ()
 ) -> Classes:
     """Classes of the additions to a model, shapes of its descriptions, and undetected changes.
 
@@ -78,7 +75,7 @@ def ambiguities(
         return Classes()
     laid = Laid(state)
     return Classes(
-        additions=classes_of(laid, context, added, given),
+        additions=classes_of(laid, added, given),
         shape=shape_of(laid) if added else None,
         undetected=undetected(laid),
     )

@@ -149,7 +149,7 @@ def diagnose(
         ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
-        members=ambiguities(evidence, context, alike, given),
+        members=ambiguities(evidence, alike, given),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),
