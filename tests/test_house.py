@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2661,
     "posterior": 2183,
     "science": 5923,
-    "diagnosis": 7969,
+    "diagnosis": 7931,
     "nights": 2549,
     "plans": 2219,
     "paper": 775,

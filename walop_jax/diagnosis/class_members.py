@@ -30,7 +30,7 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct
+from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct, sentences_in
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
@@ -59,18 +59,10 @@ def classes_of(
     it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are sentences that
     the model had before.
     """
-    classes = (
-        laid.class_of(words, at, lost, sums, added.get(name, ()))
-        for name, words, at, lost, sums in _additions(laid, added, given)
-    )
-    return tuple(addition for addition in classes if addition.names)
+    return tuple(group for group in _classes(laid, added, given) if group.names)
 
 
-def _additions(
-    laid: Laid, added: Collection[str], given: Collection[str]
-) -> Iterator[tuple[str, str, Int[np.ndarray, " a"], Vector, tuple[Sum, ...]]]:
-    """Name as it was added and as it is in the model, positions among the free parameters, change of the data rows
-    without it, its amplitudes."""
+def _classes(laid: Laid, added: Mapping[str, Collection[str]], given: Collection[str]) -> Iterator[ClassOf]:
     fit, model = laid.fit, laid.fit.model
     groups = [name for name in added if name not in model.effect_names]
     place = {int(i): k for k, i in enumerate(model.free)}
@@ -81,7 +73,7 @@ def _additions(
             if at:
                 change = signature(fit, effect.name, laid.context)
                 sums = tuple(map(tuple, effect.first_order(model.template)))
-                yield effect.name, effect.name, np.array(at), change, sums
+                yield laid.class_of(effect.name, np.array(at), change, sums, added[effect.name])
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
             indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
             at = [place[i] for i in indices if i in place]
@@ -90,7 +82,7 @@ def _additions(
             slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
             change = -slope[:, at] @ fit.values[model.free[at]]
             sums = tuple(((1.0, Sentence.parsed(text)),) for text in group)
-            yield name, "; ".join(group), np.array(at), change, sums
+            yield laid.class_of("; ".join(group), np.array(at), change, sums, added.get(name, ()))
 
 
 def _groups(
@@ -244,12 +236,7 @@ class LinearStep:
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / floor**2
-        nothing = np.zeros(len(fit.model.free))
-        member = Likeness(
-            name, evidence, sums, np.zeros(0), np.zeros((0, 0)), nothing, np.zeros((len(nothing), 0)),
-            np.zeros_like(self.laid.matrix),
-        )  # fmt: skip
-        return member, widths
+        return Likeness(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
     def candidates(
         self, addition: Likeness, alike: Collection[str]
@@ -308,8 +295,7 @@ class LinearStep:
         """
         kinds_by_sentence = [
             [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
-            for amplitude in member.sums
-            for _, sentence in amplitude
+            for sentence in sentences_in(member.sums)
         ]
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
         kinds = set(itertools.chain(*kinds_by_sentence))
@@ -331,7 +317,7 @@ class LinearStep:
         column = design.stacked([self.laid.columns.of(sums)])
         if widths is None:
             widths = np.array([amplitude[0][1].width(self.laid.context.largest) for amplitude in sums])
-        name = "; ".join(sentence.text for amplitude in sums for _, sentence in amplitude)
+        name = "; ".join(sentence.text for sentence in sentences_in(sums))
         twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
@@ -358,11 +344,11 @@ class LinearStep:
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
-        return Likeness(name, evidence, sums, amplitudes, covariance, values, slopes, change)
+        return Likeness(name, evidence, sums, change, amplitudes, covariance, values, slopes)
 
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
         """True if a model can include all sentences."""
-        sentences = [sentence for amplitude in sums for _, sentence in amplitude]
+        sentences = sentences_in(sums)
         stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
         if not all(map(self.laid.columns.has, sums)) or not all(
             s.kind in KINDS and all(isinstance(f, str) for f in s.factors) and s.text not in stated
@@ -379,4 +365,4 @@ class LinearStep:
 
 def _texts(sums: Sequence[Sum]) -> set[str]:
     """The sentences of some amplitudes."""
-    return {sentence.text for amplitude in sums for _, sentence in amplitude}
+    return {sentence.text for sentence in sentences_in(sums)}

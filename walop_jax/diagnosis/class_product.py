@@ -39,21 +39,27 @@ Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 
 
+def sentences_in(sums: Sequence[Sum]) -> list[Sentence]:
+    """All sentences of some amplitudes."""
+    return [sentence for amplitude in sums for _, sentence in amplitude]
+
+
 class Likeness(NamedTuple):
     """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
-    by its amplitudes, which have a `covariance`; `change` that of the elements of the matrix at the field points.
+    by its amplitudes, which have a `covariance`: empty for the addition itself, which the fit has. `change` is that of
+    the elements of the matrix at the field points.
     """
 
     name: str
     evidence: float
     sums: tuple[Sum, ...]
-    amplitudes: Vector
-    covariance: Matrix
-    values: Vector
-    slopes: Matrix
     change: Float[np.ndarray, "p m"]
+    amplitudes: Vector = np.zeros(0)
+    covariance: Matrix = np.zeros((0, 0))
+    values: Vector = np.zeros(0)
+    slopes: Matrix = np.zeros((0, 0))
     probability: float = 0.0
 
 
@@ -112,6 +118,11 @@ class Classes(NamedTuple):
         return bool(self.additions) or self.shape is not None
 
     @property
+    def sums(self) -> list[Sum]:
+        """Amplitudes of all members beside the additions themselves."""
+        return [total for group in self.additions for member in group.members[1:] for total in member.sums]
+
+    @property
     def shapes(self) -> tuple[Shape, ...]:
         """Those that are in the product as `Deviations`."""
         return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
@@ -155,26 +166,22 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     old, model = calibration.model, _holding(calibration, classes)
     parts = [p.part for p in model.parameters]
     new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
-    others = [member for addition in classes.additions for member in addition.members[1:]]
-    derivatives = [_derivatives(model, Described.name, member.sums) for member in others]
     if new:
-        model = _with_ties(model, new, np.concatenate(derivatives, axis=1))
+        model = _with_ties(model, new, _derivatives(model, Described.name, classes.sums))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, fitted = np.zeros(count), np.zeros((count, count))
     start[place] = calibration.values
     fitted[np.ix_(place, place)] = calibration.covariance
-    into = np.zeros((count, len(old.names)))
-    into[place, np.arange(len(old.names))] = 1.0
-    into = into @ old.selection()
+    into = np.zeros((count, len(free)))
+    into[place] = old.selection()
     of_free = calibration.covariance[np.ix_(free, free)]
     values, covariance = start.copy(), fitted.copy()
-    amplitude_columns = iter(derivatives)
     for group in classes.additions:
         conditional = into @ known_apart_from(of_free, group.at) @ into.T
         means, errors = [start], [fitted]
         for member in group.members[1:]:
-            amplitudes = next(amplitude_columns)
+            amplitudes = _derivatives(model, Described.name, member.sums)
             slopes = into @ member.slopes + amplitudes
             means.append(start + into @ member.values + amplitudes @ member.amplitudes)
             errors.append(conditional + slopes @ member.covariance @ slopes.T)
@@ -204,13 +211,7 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
 
 def _holding(calibration: Calibration, classes: Classes) -> Model:
     """The model with the sentences of all members, and with deviations."""
-    texts = dict.fromkeys(
-        sentence.text
-        for addition in classes.additions
-        for member in addition.members[1:]
-        for amplitude in member.sums
-        for _, sentence in amplitude
-    )
+    texts = dict.fromkeys(sentence.text for sentence in sentences_in(classes.sums))
     model = calibration.model
     context = effect_context(model.template, calibration.exposures)
     if (effect := classes.deviations(model, context)) is not None:

@@ -1,9 +1,9 @@
 """Recording mistakes, tried where a fit explains nothing: other readings of the data.
 
-Cameras in another order, angles that run the other way or
-start elsewhere, a field that is mirrored, turned or in other units, a polariser that was not in the beam, another
-instrument: each makes residuals far beyond what any effect makes, and each is undone by rewriting the set. An
-alternative is worth the χ² of a fit of the rewritten set at a few field points,
+Cameras in another order, angles that run the other way or start elsewhere, a field that is mirrored, turned or in
+other units, a polariser that was not in the beam, another instrument: each makes residuals far beyond what any effect
+makes, and each is undone by rewriting the set. An alternative is worth the χ² of a fit of the rewritten set at a few
+field points,
 
     χ²(θ₀ + δ),   δ = −(JᵀJ/s² + P)⁻¹ (Jᵀr/s² + P(θ₀ − θ_prior)),
 

@@ -62,9 +62,10 @@ def prune(first: State, state: State, judge: Refits) -> State:
     return state if reduced is result else _refitted(first, state, reduced, steps, judge)
 
 
-def _needed(result: FitResult, steps: Sequence[Trial], judge: Refits) -> tuple[FitResult, tuple[Trial, ...]]:
+def _needed(
+    result: FitResult, steps: tuple[Trial, ...], judge: Refits
+) -> tuple[FitResult, tuple[Trial, ...]]:
     """A fit without additions that are not worth `thresholds.LEAST_EVIDENCE` to it, and the others."""
-    steps = tuple(steps)
     while steps and len(result.model.template.effects) > 1:
         worth = {step.effect.name: evidence_of_presence(result, step.effect.name) for step in steps}
         least = min(worth, key=lambda name: worth[name])
@@ -142,9 +143,10 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     """Remainder, and a fit with a free-form term for it (None: it would be of no use)."""
     evidence = state.evidence
     result, measured = evidence.result, evidence.design.measured
-    patterns = tuple(evidence.beside_patterns[0])
-    remainder = _unexplained(evidence, patterns)
-    blocks = dict.fromkeys(block for name, _ in patterns if (block := evidence.candidates[name].block))
+    remainder = _unexplained(evidence)
+    blocks = dict.fromkeys(
+        block for name, _ in remainder.patterns if (block := evidence.candidates[name].block)
+    )
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
         blocks.pop("exposures", None)
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
@@ -166,8 +168,9 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     return remainder, after
 
 
-def _unexplained(evidence: Examination, patterns: tuple[tuple[str, float], ...]) -> Unexplained:
+def _unexplained(evidence: Examination) -> Unexplained:
     """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
+    patterns = tuple(evidence.beside_patterns[0])
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
         text = f"residuals scatter more than N_ERR (χ²/dof = {ratio:.3g}) without a known pattern"
@@ -212,7 +215,7 @@ def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     added = "; ".join(partial) or "a free-form term"
     text = f"the model with all additions predicts worse {worse}, so nothing was adopted: {added}"
-    remainder = _and(_unexplained(first.evidence, tuple(first.evidence.beside_patterns[0])), text)
+    remainder = _and(_unexplained(first.evidence), text)
     remainder = dataclasses.replace(remainder, parts=(*partial, *_contradicted(state).values()))
     return back_to(first, state), remainder
 
