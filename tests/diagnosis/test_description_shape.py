@@ -143,7 +143,7 @@ def test_a_hidden_deviation_is_in_the_errors():
         )
         for t in ([TEXT], [TEXT, other])
     )
-    shape = ambiguities(examine(one, Hypotheses(), np.random.default_rng(0)), context, {TEXT: ()}).shape
+    shape = ambiguities(examine(one, Hypotheses(), np.random.default_rng(0)), {TEXT: ()}).shape
     j = [change.text for change in shape.changes].index(other)
     exact = both.values[both.model.index(f"described.{other.replace(' ', '_')}")]
     assert exact == pytest.approx(-1.5e-3, rel=0.3)

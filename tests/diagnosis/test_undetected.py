@@ -38,8 +38,8 @@ def fitted(seed: int, *texts: str, size: float = SIZE):
     effects = [Described.saying(list(texts), [size] * len(texts))] if texts else []
     simulation = simulate(SMALL, seed=seed, effects=effects)
     result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
-    context = effect_context(result.model.template, result.calset.exposures)
-    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), context, {})
+    effect_context(result.model.template, result.calset.exposures)
+    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), {})
     assert not classes.several
     return result, classes.undetected, simulation
 
