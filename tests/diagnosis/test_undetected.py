@@ -25,7 +25,6 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import effect_context
 from walop_jax.posterior import draws
 from walop_jax.simulation.simulate import simulate
 
@@ -38,7 +37,6 @@ def fitted(seed: int, *texts: str, size: float = SIZE):
     effects = [Described.saying(list(texts), [size] * len(texts))] if texts else []
     simulation = simulate(SMALL, seed=seed, effects=effects)
     result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
-    effect_context(result.model.template, result.calset.exposures)
     classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), {})
     assert not classes.several
     return result, classes.undetected, simulation

@@ -340,8 +340,7 @@ def from_arrays(
     if filters:
         tables["FILTERS"] = filter_columns(filters)
     site = site or Site("", _NAN, _NAN, _NAN)
-    header = {"instrument": instrument, "site": site, "origin": origin, "compression": compression}
-    calset = _in_memory(tables, **header)
+    calset = _in_memory(tables, instrument=instrument, site=site, origin=origin, compression=compression)
     return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
 
 

@@ -98,10 +98,11 @@ def _labels(exposures: Exposures) -> Iterator[str]:
     """Names of targets by their KIND, numbered where exposures of a KIND have several places on the sky."""
     usual = {"clp": "calibration polariser", "moon": "Moon"}
     places = np.nan_to_num(np.stack([exposures.ra, exposures.dec], axis=1), nan=np.inf)
-    for kind, place in zip(exposures.kind, places, strict=True):
-        distinct = np.unique(places[exposures.kind == kind], axis=0)
-        number = f" {np.flatnonzero((distinct == place).all(axis=1))[0] + 1}" if len(distinct) > 1 else ""
-        yield usual.get(str(kind), str(kind)) + number
+    seen = list(zip(map(str, exposures.kind), map(tuple, places.tolist()), strict=True))
+    of_kind = {kind: sorted({place for name, place in seen if name == kind}) for kind in dict(seen)}
+    for kind, place in seen:
+        number = f" {of_kind[kind].index(place) + 1}" if len(of_kind[kind]) > 1 else ""
+        yield usual.get(kind, kind) + number
 
 
 def read_schedule(

@@ -191,8 +191,8 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 def contradicting(before: Design, after: Design) -> str:
     """KINDs of exposures that all others predict worse with the additions of a fit; empty: none.
 
-    Worse is both less probable and farther off in units of the error of the prediction, which is χ² of it: a prediction
-    that has only become broader contradicts nothing.
+    Worse is both less probable and farther off, by χ² of the prediction: one that has only become broader contradicts
+    nothing.
     """
     worse = (
         name
@@ -288,10 +288,8 @@ def predicts_unseen(
 def gains_by_kind(before: Design, after: Design) -> dict[str, tuple[float, float]]:
     """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
 
-    The second number is the share of misfits in it, −½ Δχ² of the predictions.
-
     Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
-    The gains of a KIND and of all others by themselves add up to the evidence.
+    The gains of a KIND and of all others by themselves add up to the evidence. Beside each −½ Δχ² of the predictions.
     """
     kinds = before.fit.calset.exposures.kind[before.exposure]
     names = np.unique(kinds)
@@ -334,7 +332,7 @@ class _Predicted(NamedTuple):
 def _predictions(
     rows: Float[np.ndarray, "r n"], residual: Float[np.ndarray, " r"], unit: np.ndarray, free: int
 ) -> _Predicted:
-    """The units; rows beyond those of `unit` are priors."""
+    """Predictions of the units; rows beyond those of `unit` are priors."""
     norm = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norm > 0, norm, 1.0)
     ridge = 1e-12 * np.eye(len(norm))

@@ -38,7 +38,7 @@ LEAST_SHARE_OF_NAME = 0.25
 PART = 10.0
 HOPEFUL = 1.0  # standard errors by which the linear step of a sentence must predict unseen settings better
 # Difference in evidence that is no preference; a description needs that much more than a name. More loss in ln p of
-# the exposures of one KIND, as those of others predict them, contradicts an addition.
+# the exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
 EVEN_ODDS = 3.0
 # Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
 # class are averaged.

@@ -477,10 +477,8 @@ class ResponseBlock:
         of, size = self.of, limits.COLUMNS_TOGETHER // 4
         cube = np.zeros((size, *self.used.shape, self.cameras))
         cube[: len(change)] = np.moveaxis(change.reshape(len(change), self.cameras, *self.used.shape), 1, -1)
-        pushed = np.asarray(_detectors(of.instrument, of.plan, self.found.electrons, cube, self.x, self.y))[
-            : len(change)
-        ]
-        return np.moveaxis(pushed, -1, 1).reshape(change.shape)
+        pushed = np.asarray(_detectors(of.instrument, of.plan, self.found.electrons, cube, self.x, self.y))
+        return np.moveaxis(pushed[: len(change)], -1, 1).reshape(change.shape)
 
     def _write(self, change: Float[np.ndarray, "a k n"], columns: Float[np.ndarray, "a d"]) -> None:
         """Project the flux out and write rows in the order of the residuals."""

@@ -156,10 +156,9 @@ class _Unknown(ExposureArrays):
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
     """True for a detector that depends on its own counts and the field, so that catalogues can be corrected for it."""
+    counts, at = jnp.ones((1, cameras)), tuple(map(jnp.asarray, AT))
     try:
-        jax.eval_shape(
-            lambda p: p.reported(jnp.ones((1, cameras)), blank(_Unknown), *map(jnp.asarray, AT)), part
-        )
+        jax.eval_shape(lambda p: p.reported(counts, blank(_Unknown), *at), part)
     except NotPlannedError:
         return False
     return True

@@ -97,12 +97,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     @functools.cached_property
     def calset(self) -> CalibrationSet:
         """The data of the fit; `DataError` where the run does not name them, or they are missing or have changed."""
-        inputs = () if self.product is None else self.product.inputs
-        if not inputs:
+        if self.product is None or not (inputs := self.product.inputs):
             advice = "make it with walop-jax refit"
             raise fail("does not name the data of its fit", file=self.folder, advice=advice)
         paths = self.data or [self._located(entry.path) for entry in inputs]
-        calset = read_calibration_set(*paths, kinds=self.rebuilt.model.template.kinds)
+        calset = read_calibration_set(*paths, kinds=self.product.design.kinds)
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
         return calset

@@ -159,10 +159,8 @@ class _Application:
         self.settings, self.setting_of = _settings(self.vectors, catalogue)
         if not force:
             check_validity(calibration, catalogue.points.settings)
-        at = (
-            np.nan_to_num(catalogue.points.x),
-            np.nan_to_num(catalogue.points.y),
-        )  # those without are `outside`
+        # Rows without a place are `outside`.
+        at = np.nan_to_num(catalogue.points.x), np.nan_to_num(catalogue.points.y)
         self.counts = linearised(calibration, catalogue.counts, *at)
         self.sigma = errors_of(calibration, self.counts, catalogue.sigma, *at)
         self.offset, self.slope = _rotator_zero(self.vectors)

@@ -129,7 +129,8 @@ def _since_evening(at: Any, _: Units) -> Any:
     return xp.take_along_axis(since, xp.argsort(order, axis=-1), axis=-1)
 
 
-def _one(at: Any, _: Units) -> float:
+def _unity(at: Any, _: Units) -> float:
+    """1: the detector multiplies with a power of its own counts."""
     return 1.0
 
 
@@ -182,9 +183,8 @@ PLAIN: Mapping[str, Factor] = {
             "night hours", EXPOSURE, "growing through every night (per hour since its first exposure)",
             "the same exposures of a night in another order", _since_evening, "night hours",
         ),
-        # The detector multiplies with its own counts.
         *(
-            Factor(text, COUNTS, f"growing with {of} (at 10⁶ electrons)", "the same exposures at another flux", _one)
+            Factor(text, COUNTS, f"growing with {of} (at 10⁶ electrons)", "the same exposures at another flux", _unity)
             for text, of in (
                 ("counts", "the counts"),
                 ("root counts", "the root of the counts"),
