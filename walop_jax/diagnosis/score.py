@@ -71,19 +71,22 @@ class Candidate:
 class Score:
     """The efficient score of one candidate.
 
-    `statistic` T and `rank`; `p_value` local; `amplitudes` one step from zero with `covariance`; `log_bayes` the
-    Laplace evidence against the base for the prior widths; `testable` False when the base absorbs all of it.
+    `statistic` T and `rank`; `log_p` ln of the local p; `amplitudes` one step from zero with `covariance`; `log_bayes`
+    the Laplace evidence against the base for the prior widths.
     """
 
     name: str
     statistic: float
     rank: int
-    p_value: float
     log_p: float
     amplitudes: Vector
     covariance: Float[np.ndarray, "k k"]
     log_bayes: float
-    testable: bool
+
+    @property
+    def testable(self) -> bool:
+        """False when the base absorbs all of it."""
+        return self.rank > 0
 
 
 class Projector:
@@ -238,11 +241,12 @@ class ScoreSpace:
     @functools.cached_property
     def whitened(self) -> Mapping[str, Matrix]:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
-        alive, maps = self.alive, {}
-        for name, at in self.places().items():
-            mask = alive[at]
-            maps[name] = whitening(np.where(np.outer(mask, mask), self.gram[at, at], 0.0))
-        return maps
+        return {name: whitening(self._of_alive(at)) for name, at in self.places().items()}
+
+    def _of_alive(self, at: slice = slice(None)) -> Matrix:
+        """A block of the Gram matrix, 0 for amplitudes that are not alive."""
+        alive = self.alive[at]
+        return np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
 
     def with_base(self, names: Sequence[str], widths: Vector | None = None) -> tuple[ScoreSpace, Reduction]:
         """The space when some candidates have joined the base, and what takes (C̃ᵀr, r·r) there.
@@ -266,15 +270,13 @@ class ScoreSpace:
 
     @functools.cached_property
     def _root(self) -> _Root:
-        alive = self.alive
-        return _Root(np.where(np.outer(alive, alive), self.gram, 0.0))
+        return _Root(self._of_alive())
 
     def table_after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
         noise, trials = earlier.noise_scale, earlier.trials
-        table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
-        smallest = min((score.log_p for score in table if score.testable), default=0.0)
-        return ScoreTable(table, noise, corrected_p(smallest, trials), trials)
+        table, best = self._scored(scores, noise)
+        return ScoreTable(table, noise, corrected_p(best, trials), trials)
 
     def table(self, scores: Vector, square: float, smallest: Vector | None = None) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection; `smallest` are draws of `smallest_p`."""
@@ -283,27 +285,29 @@ class ScoreSpace:
         if freedom < LEAST_REST * self.free:  # candidates that could explain anything do not show the noise
             noise_square, freedom = square, self.free
         noise = float(np.sqrt(noise_square / max(freedom, 1))) or 1.0
-        table = tuple(self._score(name, at, scores, noise) for name, at in self.places().items())
+        table, best = self._scored(scores, noise)
         if smallest is None or not len(smallest):
             return ScoreTable(table, noise, 1.0, 1.0)
-        best = min((score.log_p for score in table if score.testable), default=0.0)
         trials, below = effective_trials(smallest), int(np.sum(smallest <= best))
         often = below >= TAIL * len(smallest)
         p = (1 + below) / (1 + len(smallest)) if often else corrected_p(best, trials)
         return ScoreTable(table, noise, p, trials)
 
-    def _score(self, name: str, at: slice, scores: Vector, noise: float) -> Score:
-        w, alive = self.whitened[name], self.alive[at]
-        z = w.T @ np.where(alive, scores[at], 0.0)
-        statistic, rank = float(z @ z) / noise**2, w.shape[1]
-        log_p = float(_log_of_chi2(statistic, rank)) if rank else 0.0
-        gram = np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
-        return Score(
-            name=name, statistic=statistic, rank=rank, p_value=float(np.exp(log_p)), log_p=log_p,
-            amplitudes=-w @ z, covariance=w @ w.T * noise**2,
-            log_bayes=log_bayes(gram / noise**2, np.where(alive, scores[at], 0.0) / noise**2, self.widths[at]),
-            testable=rank > 0,
-        )  # fmt: skip
+    def _scored(self, scores: Vector, noise: float) -> tuple[tuple[Score, ...], float]:
+        """The scores of all candidates, and ln of the smallest p of those that are testable (0: none is)."""
+        table = list[Score]()
+        for name, at in self.places().items():
+            w, along = self.whitened[name], np.where(self.alive[at], scores[at], 0.0)
+            z = w.T @ along
+            statistic, rank = float(z @ z) / noise**2, w.shape[1]
+            score = Score(
+                name=name, statistic=statistic, rank=rank,
+                log_p=float(_log_of_chi2(statistic, rank)) if rank else 0.0,
+                amplitudes=-w @ z, covariance=w @ w.T * noise**2,
+                log_bayes=log_bayes(self._of_alive(at) / noise**2, along / noise**2, self.widths[at]),
+            )  # fmt: skip
+            table.append(score)
+        return tuple(table), min((score.log_p for score in table if score.testable), default=0.0)
 
     def smallest_p(self, rng: np.random.Generator, draws: int = NULL_DRAWS) -> Vector:
         """ln of the smallest p among all candidates, drawn under the base."""
@@ -320,7 +324,9 @@ class ScoreSpace:
             w = self.whitened[name]
             if w.shape[1]:
                 statistic = np.sum((w.T @ np.where(self.alive[at][:, None], drawn[at], 0.0)) ** 2, axis=0)
-                np.minimum(smallest, _log_survival(statistic, w.shape[1]), out=smallest)
+                # Millions of values, 10⁻⁴ is plenty.
+                log_p = np.interp(statistic, *_survival_grid(w.shape[1]))
+                np.minimum(smallest, log_p, out=smallest)
         return smallest
 
 
@@ -381,11 +387,6 @@ def _log_of_chi2(statistic: Any, rank: int) -> Any:
     """ln of the χ² survival function."""
     with np.errstate(divide="ignore"):  # far out there is no number so small
         return np.log(special.chdtrc(rank, statistic))
-
-
-def _log_survival(statistic: np.ndarray, rank: int) -> np.ndarray:
-    """ln of the χ² survival function by interpolation: millions of values, 10⁻⁴ is plenty."""
-    return np.interp(statistic, *_survival_grid(rank))
 
 
 @functools.cache
