@@ -22,7 +22,6 @@ from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
-from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.ray import CONDITIONS
 
@@ -112,28 +111,28 @@ def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]
             continue
         groups = effect.probes(context)
         for number, group in enumerate(groups):
-            probe = Probe(
-                effect.name if len(groups) == 1 else f"{effect.name}#{number}", effect, group, context
-            )
+            name = effect.name if len(groups) == 1 else f"{effect.name}#{number}"
+            probe = Probe(name, effect, group, context)
             if len(probe.widths):
                 yield probe
 
 
-def _can_show(calset: CalibrationSet, instrument: Instrument, effect: Effect) -> bool:
-    """True if a set is sensitive to an effect: enough field points, and the conditions of its elements."""
-    if effect.kind.over_field and len(calset.points) < FEWEST_POINTS:
-        return False
+def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
+    """The probes of effects that a set is sensitive to: enough field points, and the conditions of their elements.
+
+    All shapes of one effect have the same requirements.
+    """
+    few = len(calset.points) < FEWEST_POINTS
     columns = {name: getattr(calset.exposures, column.lower()) for name, column in CONDITIONS.items()}
     unstated = {name for name, values in columns.items() if not np.isfinite(values).any()}
     bare = dataclasses.replace(instrument, effects=())
-    return not unstated or unstated.isdisjoint(conditions_of_effect(bare, effect))
-
-
-def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:
-    """The probes of effects that a set is sensitive to; all shapes of one effect have the same requirements."""
     first = {probe.effect: probe.group[0] for probe in reversed(wanted)}
-    shown = {kind for kind, effect in first.items() if _can_show(calset, instrument, effect)}
-    return [probe for probe in wanted if probe.effect in shown]
+    hidden = {
+        kind
+        for kind, effect in first.items()
+        if (few and kind.over_field) or (unstated and unstated & conditions_of_effect(bare, effect))
+    }
+    return [probe for probe in wanted if probe.effect not in hidden]
 
 
 def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candidate]:
@@ -149,7 +148,11 @@ def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candi
         members = [member.first_order(template) for member in probe.group]
         if all(terms and all(map(columns.has, terms)) for terms in members):
             linear[probe.name] = list(itertools.chain(*members))
-    gaps = {name: [s.gap for change in sums for s in fringes_of(change)] for name, sums in linear.items()}
+    # Fringes need more wavelength nodes than all other sentences.
+    gaps = {
+        name: [sentence.gap for change in sums for _, sentence in change if sentence.kind == "fringes"]
+        for name, sums in linear.items()
+    }
     survives = columns.survives(list(itertools.chain(*gaps.values())))
     shown = [probe for probe in shown if all(survives[gap] for gap in gaps.get(probe.name, ()))]
     linear = {probe.name: linear[probe.name] for probe in shown if probe.name in linear}
@@ -165,11 +168,6 @@ def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candi
             block = own_columns(likelihood, columns.values, probe.group)
         candidates[probe.name] = Candidate(probe.name, block, probe.widths)
     return candidates
-
-
-def fringes_of(change: Change) -> Iterator[Sentence]:
-    """The sentences of a change that are about fringes, which need more wavelength nodes than all others."""
-    return (sentence for _, sentence in change if sentence.kind == "fringes")
 
 
 def sentences_of(probe: Probe) -> tuple[str, ...]:
