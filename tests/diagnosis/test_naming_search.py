@@ -111,8 +111,8 @@ def test_patterns_are_compared_with_fits_in_the_unit_of_fits(noise, size):
     assert here.best_pattern(fitted=True) == pytest.approx(exact, abs=3.0)
     assert here.best_pattern() == pytest.approx(here.table[PATTERN].log_bayes)
     assert 0.5 < here.best_pattern() * noise**2 / exact < 2.0
-    assert here.stands((), exact + 3.0, fitted=True)
-    assert not here.stands((), exact - 7.0, fitted=True)
+    assert here.stands(Described, exact + 3.0, True)
+    assert not here.stands(Described, exact - 7.0, True)
 
 
 class Refusing(Counting):

@@ -217,20 +217,17 @@ class Evidence:
             table = space.table_after(self.table, scores)
         return needed, table
 
-    def stands(self, probes: Sequence[Probe], evidence: float, *, fitted: bool = False) -> bool:
-        """True if an explanation with this evidence is preferred over every unnamed pattern.
+    def stands(self, effect: EffectKind, evidence: float, fitted: bool) -> bool:
+        """True if no pattern without a name is clearly more probable than an effect with this evidence.
 
-        It is more probable than any of them, or is significant beside those that are needed.
+        It stands as well if it is significant beside the patterns that are needed, or has no linear step.
         """
+        probes = [probe for probe in self.probes if probe.effect is effect]
+        if not probes and effect is not Described:
+            return True
         if evidence > self.best_pattern(fitted=fitted) - thresholds.EVEN_ODDS:
             return True
-        scores = (self.beside_patterns[1][probe.name] for probe in probes)
-        return any(self.is_clear(s) for s in scores)
-
-    def sentences_before_names(self) -> list[Ranked]:
-        """Sentences that are more probable than every name."""
-        best = max((item.log_bayes for item in self.significant), default=-np.inf)
-        return [item for item in self.significant_sentences if item.log_bayes > best]
+        return any(self.is_clear(self.beside_patterns[1][probe.name]) for probe in probes)
 
     # ------------------------------------------------------------------------------- indistinguishable candidates
 
@@ -268,16 +265,14 @@ class Evidence:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
         count = collections.Counter(effect for _, effects in self.parts for effect in effects)
         least = max(0.0, item.log_bayes - thresholds.IMPROBABLE)
-        return tuple(
-            dict.fromkeys(
-                effect.name
-                for probe, effects in self.parts
-                for effect in effects
-                if effect is not item.effect
-                and self.table[probe.name].testable
-                and self.table[probe.name].log_bayes - float(np.log(count[effect])) > least
-            )
+        scored = ((self.table[probe.name], effect) for probe, effects in self.parts for effect in effects)
+        likely = (
+            effect.name
+            for score, effect in scored
+            if effect is not item.effect and score.testable
+            if score.log_bayes - float(np.log(count[effect])) > least
         )
+        return tuple(dict.fromkeys(likely))
 
     def classes(self) -> Iterator[dict[str, Any]]:
         """Rows of a file: effects indistinguishable from each significant one, by linear steps."""

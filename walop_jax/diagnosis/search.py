@@ -15,7 +15,7 @@ linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def refused(evidence: Evidence, trial: Trial) -> str:
         return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
     # The residuals are noise now: a pattern can only describe the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
-    if not suffices and not _stands(evidence, trial):
+    if not suffices and not evidence.stands(trial.effect, trial.evidence, fitted):
         best = evidence.best_pattern(fitted=fitted)
         return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
     before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
@@ -136,14 +136,6 @@ def _least_explained(evidence: Evidence, trial: Trial) -> float:
     return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
 
 
-def _stands(evidence: Evidence, trial: Trial) -> bool:
-    """True if no pattern without a name is clearly more probable."""
-    probes = [probe for probe in evidence.probes if probe.effect is trial.effect]
-    if not probes and trial.effect is not Described:  # without a linear step
-        return True
-    return evidence.stands(probes, trial.evidence, fitted=trial.fit is not None)
-
-
 def hopeless(evidence: Evidence, trial: Trial) -> str:
     """Reason not to try an effect that is refused even if it is better by the error of linear steps."""
     if trial.evidence <= thresholds.LINEAR_BELOW:
@@ -155,19 +147,24 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
 
 def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
-    trials = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
-    sentences = evidence.sentences_before_names()[: thresholds.MOST_SENTENCES]
-    return sorted((*trials, *(linear_trial(evidence, item) for item in sentences)), key=names_first)
+    names = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
+    best = max((item.log_bayes for item in evidence.significant), default=-np.inf)
+    return sorted([*names, *_sentences(evidence, best)], key=names_first)
+
+
+def _sentences(evidence: Evidence, least: float, tried: Sequence[Trial] = ()) -> list[Trial]:
+    """The leading sentences with an evidence above `least`, without those that were tried, by linear steps."""
+    probable = (item for item in evidence.significant_sentences if item.log_bayes > least)
+    untried = [item for item in probable if not any(item is trial.item for trial in tried)]
+    return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
 
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
     remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
-    suffices, linear = (
-        explains(remaining, evidence.dof - item.score.rank),
-        item.log_bayes + evidence.by_fit(item.score),
-    )
+    suffices = explains(remaining, evidence.dof - item.score.rank)
+    linear = item.log_bayes + evidence.by_fit(item.score)
     return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, linear=linear)
 
 
@@ -183,7 +180,7 @@ class _Log:
     evidence: Evidence
     trials: dict[str, Trial] = dataclasses.field(default_factory=dict)
 
-    def passed(self, trials: Iterable[Trial], why: Any = refused) -> list[Trial]:
+    def passed(self, trials: Iterable[Trial], why: Callable[[Evidence, Trial], str]) -> list[Trial]:
         """The trials that are not refused; all are noted."""
         judged = [dataclasses.replace(trial, refused=why(self.evidence, trial)) for trial in trials]
         self.trials.update((trial.name, trial) for trial in judged)
@@ -200,7 +197,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
         new: list[Trial] = []
         while waiting and not (ended := judge.over(fits)):
             linear, fits = waiting.pop(0), fits + 1
-            if fitted := log.passed([judge.fitted(evidence, linear)]):
+            if fitted := log.passed([judge.fitted(evidence, linear)], refused):
                 new += fitted
                 tried = [fitted[0] if candidate is linear else candidate for candidate in tried]
                 if _is_sure(fitted[0], waiting):
@@ -209,7 +206,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
         # Names that came first by linear steps were refused: these steps were inaccurate.
         if not (passed or sentences_asked):
             sentences_asked = True
-            waiting = log.passed(_sentences_behind(evidence, tried), hopeless)
+            waiting = log.passed(_sentences(evidence, -np.inf, tried), hopeless)
             tried += waiting
             if waiting:
                 continue
@@ -219,15 +216,16 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             others_asked = True
             alternatives, choices = judge.others(dataclasses.replace(state, fits=fits))
             fits += len(alternatives)
-            alternatives = log.passed(alternatives)
+            alternatives = log.passed(alternatives, refused)
             passed, tried = [*passed, *alternatives], [*tried, *alternatives]
         for trial in judge.decided(sorted(passed, key=names_first)):
-            if accepted := next(iter(log.passed([judge.confronted(evidence, trial)])), None):
+            if accepted := next(iter(log.passed([judge.confronted(evidence, trial)], refused)), None):
                 break
         # Sentences were behind a name that was refused: they come before another one that is less probable.
         if accepted is not None and not confirmed:
-            confirmed = [accepted]
-            waiting = log.passed(_sentences_behind(evidence, tried, accepted), hopeless)
+            confirmed, item = [accepted], accepted.item
+            least = -np.inf if item is None else item.log_bayes + thresholds.EVEN_ODDS
+            waiting = log.passed(_sentences(evidence, least, tried), hopeless)
             tried += waiting
             accepted = None if waiting else accepted
         if not waiting or (ended := judge.over(fits)):
@@ -246,14 +244,6 @@ def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
     error = abs(trial.evidence - trial.linear)
     reach = 2.0 * error if error > thresholds.LINEAR_GOOD else 0.0
     return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
-
-
-def _sentences_behind(evidence: Evidence, tried: Sequence[Trial], name: Trial | None = None) -> list[Trial]:
-    """The leading sentences, without those that were tried; clearly more probable than a name, if it is given."""
-    least = -np.inf if name is None or name.item is None else name.item.log_bayes + thresholds.EVEN_ODDS
-    probable = (item for item in evidence.significant_sentences if item.log_bayes > least)
-    untried = [item for item in probable if not any(item is trial.item for trial in tried)]
-    return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
