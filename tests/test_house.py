@@ -205,7 +205,7 @@ MOST_LINES = {
     "calibration": 2661,
     "posterior": 2182,
     "science": 5921,
-    "diagnosis": 7929,
+    "diagnosis": 7904,
     "nights": 2549,
     "plans": 2219,
     "paper": 775,

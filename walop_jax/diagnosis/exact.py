@@ -131,18 +131,18 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
 
 
 def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
-    """Add an effect at the given values to the fitted model and fit everything again."""
-    model = with_effects(base.model, [instance], context)
-    return try_model(base, instance.kind, model, base.values, prior_shapes)
+    """Add an effect at the given values to the fitted model and fit everything again.
+
+    Sentences join those that the model has. It shares the prior of one name with all of its `prior_shapes`.
+    """
+    if isinstance(instance, Described):
+        model = with_sentences(base.model, instance, context)
+    else:
+        model = with_effects(base.model, [instance], context)
+    return _try_model(base, instance.kind, model, base.values, prior_shapes)
 
 
-def try_sentences(base: FitResult, description: Described, context: Context, count: int) -> Trial:
-    """Add sentences to the fitted model, beside those that it has, and fit again; they are among `count` of them."""
-    model = with_sentences(base.model, description, context)
-    return try_model(base, Described, model, base.values, count)
-
-
-def try_model(
+def _try_model(
     base: FitResult, effect: EffectKind, model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
 ) -> Trial:
     """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
@@ -156,7 +156,7 @@ def try_model(
     )
     bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.expansion.matrix).all():
-        bayes = log_evidence_ratio(base, result) - (float(np.log(prior_shapes)) if prior_shapes > 1 else 0.0)
+        bayes = log_evidence_ratio(base, result) - float(np.log(prior_shapes))
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 
@@ -241,18 +241,23 @@ def evidence_of_presence(result: FitResult, name: str) -> float:
 
 def refit_without(result: FitResult, name: str) -> FitResult:
     """Take an effect out of a fitted model and fit again, with errors scaled only if the residuals require it."""
+    likelihood, values = _bare(result, name)
+    return fit(likelihood, start=values)
+
+
+def _bare(result: FitResult, name: str) -> tuple[Likelihood, Vector]:
+    """The likelihood of a fitted model without an effect, and the fitted values of its parameters."""
     model = model_without(result.model, name)
-    start = dict(zip(result.model.names, result.values, strict=True))
-    return fit(Likelihood.of(result.calset, model), start=np.array([start[n] for n in model.names]))
+    at = [result.model.index(remaining) for remaining in model.names]
+    return Likelihood.of(result.calset, model), result.values[at]
 
 
 def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
     """Change of the residuals (data rows) by an active effect: theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
     if effect.kind.is_structural():
-        model = model_without(result.model, name)
-        indices = [result.model.index(n) for n in model.names]
-        bare = Likelihood.of(result.calset, model).residuals(result.values[indices])[1]
+        likelihood, values = _bare(result, name)
+        bare = likelihood.residuals(values)[1]
     else:
         values = result.values.copy()
         values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
@@ -314,7 +319,7 @@ def other_descriptions(
         tell(f"trying another description: {choice.change}")
         model = described_otherwise(result.model, choice.change, context)
         try:
-            trial = try_model(result, OtherDescription, model, start, len(sentences))
+            trial = _try_model(result, OtherDescription, model, start, len(sentences))
         except ValueError:  # a free parameter of a removed element has no prior and is undetermined
             continue
         assert trial.fit is not None

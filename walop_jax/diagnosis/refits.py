@@ -19,7 +19,6 @@ from walop_jax.diagnosis.exact import (
     other_descriptions,
     refit_without,
     try_effect,
-    try_sentences,
     try_shapes,
     with_refuted_priors_widened,
 )
@@ -81,7 +80,7 @@ class Refits:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
             description = self._with_best_times(evidence, shortest(item))
-            refitted = try_sentences(evidence.result, description, self.context, len(evidence.sentences))
+            refitted = try_effect(evidence.result, description, self.context, len(evidence.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, self.context, shapes)
@@ -184,7 +183,7 @@ def settled(result: FitResult, names: Collection[str]) -> FitResult:
 
 
 def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResult:
-    """A fit without an effect, beside the `rest` of those that were added."""
+    """A fit without an effect; `remaining` are the names of the other additions."""
     return settled(refit_without(result, name), remaining)
 
 
@@ -192,14 +191,16 @@ def contradicting(before: Design, after: Design) -> str:
     """KINDs of exposures that all others predict worse with the additions of a fit; empty: none.
 
     Worse is both less probable and farther off, by χ² of the prediction: one that has only become broader contradicts
-    nothing.
+    nothing. Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the
+    others.
     """
-    worse = (
-        name
-        for name, (gain, misfit) in gains_by_kind(before, after).items()
-        if gain < -thresholds.EVEN_ODDS and misfit < -thresholds.EVEN_ODDS
-    )
-    return ", ".join(f"KIND {kind}" for kind in worse)
+    kinds = before.fit.calset.exposures.kind[before.exposure]
+    names = np.unique(kinds)
+    if len(names) < 2:
+        return ""
+    first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
+    worse = (gains_of_units(kinds, first, second) < -thresholds.EVEN_ODDS).all(axis=0)
+    return ", ".join(f"KIND {kind}" for kind in names[worse])
 
 
 def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> list[Trial]:
@@ -285,25 +286,11 @@ def predicts_unseen(
     return True
 
 
-def gains_by_kind(before: Design, after: Design) -> dict[str, tuple[float, float]]:
-    """Gain in ln p of the exposures of each KIND, as all others predict them, by what one design has beyond another.
-
-    Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the others.
-    The gains of a KIND and of all others by themselves add up to the evidence. Beside each −½ Δχ² of the predictions.
-    """
-    kinds = before.fit.calset.exposures.kind[before.exposure]
-    names = np.unique(kinds)
-    if len(names) < 2:
-        return {}
-    first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    gains = map(tuple, gains_of_units(kinds, first, second).T.tolist())
-    return dict(zip(map(str, names), gains, strict=True))
-
-
 def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, "2 u"]:
     """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another, and −½ Δχ².
 
-    χ² is that of the prediction, in both models with the errors of that which leaves less scatter.
+    χ² is that of the prediction, in both models with the errors of that which leaves less scatter. The gains of a unit
+    and of all others by themselves add up to the evidence.
 
     Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
     errors in whose units the data rows are.

@@ -177,9 +177,8 @@ def _examined(
         after = after.remarked(sentence)
     # Where χ² contradicts the model given, the steps name the missing effects.
     explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
-    before = diagnosis.before.judged()
-    if explained:
-        before = examined(diagnosis.before, seed, as_written=True, candidates=tables[0])
+    before = diagnosis.before
+    before = examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.judged()
     return dataclasses.replace(diagnosis, before=before, after=after)
 
 
