@@ -1,27 +1,35 @@
-"""What each rule of the search is worth: every one switched off, on the frozen benchmark and on scenes that made none.
+"""What each rule of the search is worth: every one switched off, on scenes of linear steps and on sets that are fitted.
 
     python tests/studies/benchmark/generate.py OLD
     python tests/studies/benchmark/generate.py NEW --seed 2 --new
     python tests/studies/ablation.py OLD NEW [--each 1] [--quiet 40] [--pairs 40]       (a quarter of an hour)
+    python tests/studies/ablation.py --fits [--seed 54] [--first 0] [--budget MINUTES] [--save FILE]
+    python tests/studies/ablation.py --join FILE...
 
 OLD are the published scenes, on which the rules were made; NEW have another simulated run, other noise, and shapes that
 are nowhere else (`benchmark/new_shapes.py`). Of each shape and ratio `--each` scenes are taken, `--quiet` in which
-nothing is hidden, and beside NEW `--pairs` of two effects of the catalogue. A rule is asked only of scenes in which it
-decides something; the others cannot change.
+nothing is hidden, and beside NEW `--pairs` of two effects of the catalogue. With `--fits` sets come from the grammar of
+`sealed.py`, and the search fits them as a diagnosis does. A rule is asked only of scenes in which it decides something;
+the others cannot change.
 
 The table has, for each rule, the scenes in which it decides, those whose additions or verdict change without it, and
-how many of these are better and worse *with* it: right or in its class before open before wrong.
+how many of these are better and worse *with* it: right or in its class before open before wrong. Of sets also those
+whose matrix between the points is nearer to the truth, or farther off, by 1.2 ×, and that are trusted and wrong.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
+import pickle
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import jax
@@ -33,35 +41,161 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 from blind import Scene  # noqa: E402
 from generate import STEP, Layout  # noqa: E402
 from judge import opened  # noqa: E402
+from studies.sealed import WORSE, sealed  # noqa: E402
+from studies.sealed_judging import judged, right_of  # noqa: E402
 
-from walop_jax.diagnosis import examination, search, thresholds  # noqa: E402
+from walop_jax.diagnosis import examination, refits, remainder, search, thresholds, workflow  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
+from walop_jax.diagnosis.refits import Refits  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
+from walop_jax.model.effects import Described  # noqa: E402
 
-Switch = Callable[[], Any]
-RULES: dict[str, tuple[Any, str, Callable[[Any], Any]]] = {
-    # rule: where it is, its name there, and what stands in its place when it is off
-    "a name explains a quarter of what is surely missing (`LEAST_SHARE_OF_NAME`)": (
-        thresholds, "LEAST_SHARE_OF_NAME", lambda _: 0.0,
-    ),
-    "one-sided amplitudes on their side (`follow_physics`)": (
-        examination, "follow_physics", lambda _: lambda *a: True,
-    ),
-    "patterns without a name compete (`stands`)": (Evidence, "stands", lambda _: lambda *a: True),
-    "a description needs 3 more than a name (`EVEN_ODDS`)": (
-        search, "names_first", lambda _: lambda trial: -trial.evidence,
-    ),
-    "a share of what is missing (`LEAST_SHARE`)": (thresholds, "LEAST_SHARE", lambda _: 0.0),
-    "rivals within 8 are tried (`WITHIN`)": (thresholds, "WITHIN", lambda _: 0.0),
-}  # fmt: skip
-WORTH = {"right": 2, "in its class": 2, "open": 1, "not detected": 1, "wrong": 0}
+Place = tuple[Any, str]
+
+
+class Rule(NamedTuple):
+    """A rule: what is replaced, by what, and where it shows that it decides (default: there), by which answers."""
+
+    text: str
+    places: tuple[Place, ...]
+    off: Callable[[Any], Any]
+    decides: Callable[[tuple[Any, ...], Any], bool]
+    watched: tuple[Place, ...] = ()
+
+
+def always(answer: Any) -> Callable[[Any], Any]:
+    """A replacement that has one answer."""
+    return lambda _: lambda *args: answer
+
+
+def number(value: float) -> Callable[[Any], Any]:
+    """Another value of a threshold."""
+    return lambda _: value
+
+
+def answers(args: tuple[Any, ...], answer: Any) -> bool:
+    """True where there is an answer."""
+    return bool(answer)
+
+
+def refuses(args: tuple[Any, ...], answer: Any) -> bool:
+    """True where the answer is no."""
+    return not answer
+
+
+def _of(text: str) -> Callable[[tuple[Any, ...], Any], bool]:
+    """Refusals with a reason that begins so."""
+    return lambda args, answer: answer.startswith(text)
+
+
+def _further(real: Any, behind: bool) -> Any:
+    """No descriptions behind names that were refused; or none between such a name and another one."""
+
+    def sentences(evidence: Any, least: float, *tried: Any) -> Any:
+        asked = bool(tried) and np.isfinite(least) != behind
+        return [] if asked else real(evidence, least, *tried)
+
+    return sentences
+
+
+REFUSED: tuple[Place, ...] = ((search, "refused"),)
+RULES = (
+    # Those of linear steps as well
+    Rule("a name explains a quarter of what is surely missing (`LEAST_SHARE_OF_NAME`)",
+         ((thresholds, "LEAST_SHARE_OF_NAME"),), number(0.0), _of("it explains"), REFUSED),
+    Rule("an addition explains a tenth of what is missing (`LEAST_SHARE`)",
+         ((thresholds, "LEAST_SHARE"),), number(0.0), _of("it explains"), REFUSED),
+    Rule("one-sided amplitudes on their side (`follow_physics`)",
+         ((examination, "follow_physics"),), always(True), refuses),
+    Rule("patterns without a name compete (`stands`)", ((Evidence, "stands"),), always(True), refuses),
+    Rule("a description needs 3 more than a name (`names_first`)",
+         ((search, "names_first"), (refits, "names_first")), lambda _: lambda trial: -trial.evidence,
+         lambda args, answer: args[0].effect is Described),
+    Rule("names within ln B = 8 of the best are tried (`leaders`)",
+         ((search, "leaders"),), lambda _: lambda ranked: ranked[:1], lambda args, answer: len(answer) > 1),
+    Rule("above ln B = 150 trials may be better than their linear step (`LINEAR_BELOW`)",
+         ((thresholds, "LINEAR_BELOW"),), number(np.inf),
+         lambda args, answer: bool(answer) and answer[0].log_bayes > thresholds.LINEAR_BELOW, ((search, "leaders"),)),
+    Rule("descriptions are tried once all names were refused",
+         ((search, "_sentences"),), lambda real: _further(real, behind=True),
+         lambda args, answer: len(args) > 2 and np.isneginf(args[1]) and bool(answer)),
+    Rule("descriptions come before a name that is less probable than the refused one",
+         ((search, "_sentences"),), lambda real: _further(real, behind=False),
+         lambda args, answer: len(args) > 2 and np.isfinite(args[1]) and bool(answer)),
+    Rule("evidence counts in units of the scatter behind all candidates (`FLOOR`)",
+         ((thresholds, "FLOOR"),), number(np.inf), lambda args, answer: args[0].floor > 1.0, REFUSED),
+    # Those of fits
+    Rule("a description predicts states and cells by its linear step, to be fitted (`_hopeful`)",
+         ((Refits, "_hopeful"),), always(True), refuses),
+    Rule("data that were left out agree better with an addition",
+         REFUSED, lambda real: lambda evidence, trial: real(evidence, dataclasses.replace(trial, compared={})),
+         _of("data that were left out")),
+    Rule("no KIND contradicts an addition, nor all of them (`contradicting`)",
+         ((refits, "contradicting"), (remainder, "contradicting")), always(""), answers),
+    Rule("even trials are decided with errors as stated (`decided`)",
+         ((Refits, "decided"),), lambda _: lambda self, trials: trials,
+         lambda args, answer: [t.name for t in answer] != [t.name for t in args[1]]),
+    Rule("structural effects and other descriptions of the instrument (`others`)",
+         ((Refits, "others"),), lambda _: lambda self, state: ([], state.choices),
+         lambda args, answer: bool(answer[0])),
+    Rule("a time at which a description starts or stops is fitted (`_with_best_times`)",
+         ((Refits, "_with_best_times"),), lambda _: lambda self, evidence, description: description,
+         lambda args, answer: answer is not args[2]),
+    Rule("priors of additions that the data refute are widened",
+         ((refits, "with_refuted_priors_widened"),), lambda _: lambda model, values, name: model,
+         lambda args, answer: answer is not args[0]),
+    Rule("additions that the final model does not need go (`LEAST_EVIDENCE`)",
+         ((remainder, "_needed"),), lambda _: lambda result, steps, judge: (result, steps),
+         lambda args, answer: answer[0] is not args[0]),
+    Rule("names that leave a poor fit poor are parts (`PART`)", ((remainder, "_parts"),), always({}), answers),
+    Rule("a free-form term for the remainder, where it predicts (`USEFUL`)",
+         ((remainder, "_with_free_form"),), lambda real: lambda *args: (real(*args)[0], None),
+         lambda args, answer: answer[1] is not None),
+    Rule("a model that predicts worse than the first is not adopted (`_worse`)",
+         ((remainder, "_worse"),), always(""), answers),
+    Rule("more than two descriptions are one thing that none holds (`MOST_SENTENCES`)",
+         ((remainder, "thresholds"),), lambda real: SimpleNamespace(**(vars(real) | {"MOST_SENTENCES": 99})),
+         lambda args, answer: sum(len(step.groups) for step in args[1].steps) > thresholds.MOST_SENTENCES,
+         ((remainder, "concluded"), (workflow, "concluded"))),
+    Rule("one number that the set states, instead of names (`instead_of_names`)",
+         ((workflow, "instead_of_names"),), always(""), answers),
+    Rule("another reading of the data is asked (`mixups_of`)", ((workflow, "mixups_of"),), always(()), answers),
+)  # fmt: skip
+OF_LINEAR_STEPS = RULES[:10]
+WORTH = {"right": 2, "in its class": 2, "class": 2, "open": 1, "not detected": 1, "": 1, "wrong": 0}
 
 
 @contextlib.contextmanager
-def without(rule: str) -> Iterator[None]:
+def without(rule: Rule) -> Iterator[None]:
     """The search without a rule."""
-    owner, name, off = RULES[rule]
-    with patch.object(owner, name, off(getattr(owner, name))):
+    with contextlib.ExitStack() as stack:
+        for owner, name in rule.places:
+            stack.enter_context(patch.object(owner, name, rule.off(getattr(owner, name))))
         yield
+
+
+@contextlib.contextmanager
+def watched(rules: tuple[Rule, ...]) -> Iterator[set[str]]:
+    """The search, and the rules that decide something in it."""
+    decided = set[str]()
+
+    def noting(real: Any, rule: Rule) -> Any:
+        def noted(*args: Any, **names: Any) -> Any:
+            answer = real(*args, **names)
+            if rule.decides(args, answer):
+                decided.add(rule.text)
+            return answer
+
+        return noted
+
+    with contextlib.ExitStack() as stack:
+        for rule in rules:
+            for owner, name in rule.watched or rule.places:
+                stack.enter_context(patch.object(owner, name, noting(getattr(owner, name), rule)))
+        yield decided
+
+
+# ------------------------------------------------------------------------------------------------------ linear steps
 
 
 class Scenes:
@@ -121,107 +255,137 @@ def _outcome(verdict: Any, truth: dict[str, Any]) -> str:
     return "open" if verdict.kind == "unexplained" and not named else "wrong"
 
 
-def decided(scenes: Scenes, numbers: list[int]) -> tuple[dict[int, dict[str, Any]], dict[str, set[int]]]:
-    """Every scene judged with all rules, and the scenes in which each rule decides something."""
-    judged, where = {}, {rule: set[int]() for rule in RULES}
-    for number in numbers:
-        fired: set[str] = set()
-        with contextlib.ExitStack() as stack:
-            for rule, watch in WATCHED.items():
-                owner, name, _ = RULES[rule]
-                stack.enter_context(patch.object(owner, name, watch(getattr(owner, name), fired, rule)))
-            stack.enter_context(patch.object(search, "leaders", _leaders(search.leaders, fired)))
-            stack.enter_context(patch.object(search, "refused", _refused(search.refused, fired)))
-            judged[number] = scenes.judged(number)
-        for rule in fired:
-            where[rule].add(number)
-    return judged, where
-
-
-def _when(answer: Any) -> Callable[[Callable[..., Any], set[str], str], Callable[..., Any]]:
-    """Watch of a rule that decides where it gives one answer."""
-
-    def watch(real: Callable[..., Any], fired: set[str], rule: str) -> Callable[..., Any]:
-        def told(*args: Any) -> Any:
-            found = real(*args)
-            if found is answer:
-                fired.add(rule)
-            return found
-
-        return told
-
-    return watch
-
-
-def _of_descriptions(real: Callable[..., Any], fired: set[str], rule: str) -> Callable[..., Any]:
-    def told(trial: Any) -> float:
-        if trial.effect is search.Described:
-            fired.add(rule)
-        return real(trial)
-
-    return told
-
-
-_NAMES = list(RULES)
-WATCHED = {_NAMES[1]: _when(False), _NAMES[2]: _when(False), _NAMES[3]: _of_descriptions}
-
-
-def _leaders(real: Callable[..., Any], fired: set[str]) -> Callable[..., Any]:
-    def told(ranked: Any) -> Any:
-        found = real(ranked)
-        if len(found) > 1:
-            fired.add(_NAMES[5])
-        return found
-
-    return told
-
-
-def _refused(real: Callable[..., str], fired: set[str]) -> Callable[..., str]:
-    def told(evidence: Any, trial: Any) -> str:
-        reason = real(evidence, trial)
-        if reason.startswith("it explains"):
-            fired.update((_NAMES[0], _NAMES[4]))
-        return reason
-
-    return told
-
-
 def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
     """For each rule: scenes in which it decides, changed without it, better and worse with it."""
-    judged, where = decided(scenes, list(scenes.truth))
-    print("with all rules", Counter(one["outcome"] for one in judged.values()), flush=True)
+    before, where = {}, {rule.text: list[int]() for rule in OF_LINEAR_STEPS}
+    for scene in scenes.truth:
+        with watched(OF_LINEAR_STEPS) as decided:
+            before[scene] = scenes.judged(scene)
+        for text in decided:
+            where[text].append(scene)
+    print("with all rules", Counter(judged["outcome"] for judged in before.values()), flush=True)
     rows = {}
-    for rule in RULES:
+    for rule in OF_LINEAR_STEPS:
         changed = better = worse = 0
         with without(rule):
-            for number in sorted(where[rule]):
-                now, before = scenes.judged(number), judged[number]
-                changed += any(now[key] != before[key] for key in ("kind", "added"))
-                gain = WORTH[before["outcome"]] - WORTH[now["outcome"]]
+            for scene in where[rule.text]:
+                now = scenes.judged(scene)
+                changed += any(now[key] != before[scene][key] for key in ("kind", "added"))
+                gain = WORTH[before[scene]["outcome"]] - WORTH[now["outcome"]]
                 better, worse = better + (gain > 0), worse + (gain < 0)
-        rows[rule] = len(where[rule]), changed, better, worse
-        print(rule, rows[rule], flush=True)
+        rows[rule.text] = len(where[rule.text]), changed, better, worse
+        print(rule.text, rows[rule.text], flush=True)
     return rows
+
+
+# -------------------------------------------------------------------------------------------------------------- fits
+
+
+class Fitted(NamedTuple):
+    """The answer to a sealed set: verdict and names, are these right, error of the matrix, trusted and wrong."""
+
+    verdict: str
+    right: str
+    error: float
+    wrong: bool
+
+
+def fitted(one: Any) -> Fitted:
+    """Diagnose a sealed set."""
+    try:
+        diagnosis = workflow.diagnose(one.calset)
+    except (DataError, ValueError) as error:
+        return Fitted(f"refused: {str(error)[:80]}", "", np.nan, False)
+    trusted = diagnosis.after.trusted and diagnosis.verdict != "unexplained"
+    product = judged(diagnosis.calibration(), trusted, one)
+    names = (
+        "; ".join(c.text for c, *_ in step.descriptions) if step.descriptions else step.effect
+        for step in diagnosis.steps
+    )
+    verdict = f"{diagnosis.verdict} {', '.join(names)}{'' if trusted else ', not trusted'}"
+    return Fitted(verdict, right_of(one, diagnosis), product.error, trusted and product.wrong)
+
+
+def fits(seed: int, first: int, budget: float, save: Path | None) -> list[dict[str, Any]]:
+    """Sets with all rules, and without each that decides something there, until `budget` minutes are over."""
+    rows, end, count = list[dict[str, Any]](), time.monotonic() + 60.0 * budget, first
+    while time.monotonic() < end:
+        one = sealed(count, seed, 8)
+        with watched(RULES) as decided:
+            row: dict[str, Any] = {"number": count, "hidden": one.text, "all": fitted(one), "rules": {}}
+        for rule in RULES:
+            if rule.text in decided:
+                with without(rule):
+                    row["rules"][rule.text] = fitted(one)
+        rows.append(row)
+        changed = [text for text, now in row["rules"].items() if now.verdict != row["all"].verdict]
+        print(
+            f"{count}: {one.text} | {row['all']} | {len(decided)} rules decide; changed without: {changed}",
+            flush=True,
+        )
+        if save:
+            save.write_bytes(pickle.dumps(rows))
+        jax.clear_caches()  # the programs of every set are others
+        count += 1
+    return rows
+
+
+def table_of_fits(rows: list[dict[str, Any]]) -> str:
+    """Markdown: for each rule the sets in which it decides, changed, and better and worse in each way with it."""
+    head = f"of {len(rows)} sets: decides; changed | answer better; worse | matrix better; worse | wrong without; with"
+    lines = [f"| rule | {head} |", "| --- | --- | --- | --- | --- |"]
+    for rule in RULES:
+        pairs = [(row["all"], row["rules"][rule.text]) for row in rows if rule.text in row["rules"]]
+        changed = [
+            (a, b)
+            for a, b in pairs
+            if a.verdict != b.verdict or not np.isclose(a.error, b.error, 1e-3, equal_nan=True)
+        ]
+        gains = [WORTH[a.right] - WORTH[b.right] for a, b in changed]
+        ratios = [b.error / a.error for a, b in changed]
+        better, worse = (sum(ratio > WORSE for ratio in some) for some in (ratios, [1.0 / r for r in ratios]))
+        answer = f"{sum(g > 0 for g in gains)}; {sum(g < 0 for g in gains)}"
+        only = [
+            sum(x.wrong and not y.wrong for x, y in some) for some in ([(b, a) for a, b in changed], changed)
+        ]
+        wrong = "; ".join(map(str, only))
+        lines.append(
+            f"| {rule.text} | {len(pairs)}; {len(changed)} | {answer} | {better}; {worse} | {wrong} |"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("old", type=Path)
-    parser.add_argument("new", type=Path)
-    for name, count in {"each": 1, "quiet": 40, "pairs": 40}.items():
+    parser.add_argument("folders", type=Path, nargs="*", metavar="OLD NEW")
+    for name, count in {"each": 1, "quiet": 40, "pairs": 40, "first": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=count)
-    parser.add_argument("--seed", type=int, default=2, help="of NEW")
+    parser.add_argument("--seed", type=int, default=2, help="of NEW, or of the sets that are fitted")
+    parser.add_argument("--fits", action="store_true", help="sets of the grammar of sealed.py, fitted")
+    parser.add_argument("--budget", type=float, default=60.0, help="minutes after which no set is begun")
+    parser.add_argument("--save", type=Path, help="file of the sets so far, written after each")
+    parser.add_argument("--join", type=Path, nargs="+", help="such files: print their table")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    tables = []
-    for folder, seed, pairs in ((options.old, 1, 0), (options.new, options.seed, options.pairs)):
+    if options.join:
+        print(table_of_fits([row for file in options.join for row in pickle.loads(file.read_bytes())]))
+        return
+    if options.fits:
+        print(table_of_fits(fits(options.seed, options.first, options.budget, options.save)))
+        return
+    tables, (old, new) = [], options.folders
+    for folder, seed, pairs in ((old, 1, 0), (new, options.seed, options.pairs)):
         scenes = Scenes(folder, seed, options.each, options.quiet, pairs)
         tables.append((len(scenes.truth), ablation(scenes)))
     counts = " | ".join(f"of {count} scenes: decides; changed; better; worse with it" for count, _ in tables)
     print(f"| rule | {counts} |\n| --- | --- | --- |")
-    for rule in RULES:
-        print(f"| {rule} | " + " | ".join("; ".join(map(str, table[rule])) for _, table in tables) + " |")
+    for rule in OF_LINEAR_STEPS:
+        print(
+            f"| {rule.text} | "
+            + " | ".join("; ".join(map(str, table[rule.text])) for _, table in tables)
+            + " |"
+        )
 
 
 if __name__ == "__main__":
