@@ -26,7 +26,7 @@ import pickle
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -41,14 +41,19 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 from blind import Scene  # noqa: E402
 from generate import STEP, Layout  # noqa: E402
 from judge import opened  # noqa: E402
-from studies.sealed import WORSE, sealed  # noqa: E402
+from studies.sealed import WORSE, Sealed, sealed  # noqa: E402
 from studies.sealed_judging import judged, right_of  # noqa: E402
 
-from walop_jax.diagnosis import examination, refits, remainder, search, thresholds, workflow  # noqa: E402
+from walop_jax.data.records import CalibrationSet  # noqa: E402
+from walop_jax.diagnosis import exact, examination, refits, remainder, search, thresholds, workflow  # noqa: E402
+from walop_jax.diagnosis.design import Design  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Ranked  # noqa: E402
 from walop_jax.diagnosis.refits import Refits  # noqa: E402
+from walop_jax.fit.refit import FitResult  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
-from walop_jax.model.effects import Described  # noqa: E402
+from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.model.effects import Described, Effect  # noqa: E402
 
 Place = tuple[Any, str]
 
@@ -162,6 +167,7 @@ RULES = (
     Rule("another reading of the data is asked (`mixups_of`)", ((workflow, "mixups_of"),), always(()), answers),
 )  # fmt: skip
 OF_LINEAR_STEPS = RULES[:10]
+INSTEAD = workflow.instead_of_names
 WORTH = {"right": 2, "in its class": 2, "class": 2, "open": 1, "not detected": 1, "": 1, "wrong": 0}
 
 
@@ -281,6 +287,76 @@ def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
 # -------------------------------------------------------------------------------------------------------------- fits
 
 
+MOST_KEPT = 3  # examinations beside the first: each has the columns of all candidates
+SLOW: tuple[Place, ...] = (
+    (workflow, "fit"), (workflow, "mixups_of"), (refits, "examine"), (refits, "fit"), (refits, "try_effect"),
+    (exact, "try_effect"), (refits, "other_descriptions"), (refits, "refit_without"), (refits, "before_and_after"),
+    (remainder, "try_effect"), (remainder, "evidence_of_presence"), (remainder, "held_out"), (refits, "held_out"),
+    (Refits, "_hopeful"),
+)  # fmt: skip
+"""Work that no rule is in: searches of one set do it once, up to where they part."""
+
+
+@contextlib.contextmanager
+def remembered() -> Iterator[None]:
+    """Results of `SLOW` functions by the content of their arguments; the random numbers go on as if all were run."""
+    answers: dict[Any, tuple[Any, Any]] = {}
+    kept: list[Any] = []  # what has an identity in a key, so that none is given away again
+
+    def once(real: Any, name: str) -> Any:
+        def remembering(*args: Any, **names: Any) -> Any:
+            key = name, tuple(map(_key, args)), tuple((k, _key(v)) for k, v in sorted(names.items()))
+            generator = next((a for a in args if isinstance(a, np.random.Generator)), None)
+            if key not in answers:
+                answer = real(*args, **names)
+                answers[key] = answer, None if generator is None else generator.bit_generator.state
+                kept.extend(map(_identified, args))
+                examined = [k for k in answers if k[0] == "examine"]
+                for superseded in examined[1:-MOST_KEPT]:
+                    del answers[superseded]
+            answer, state = answers[key]
+            if generator is not None:
+                generator.bit_generator.state = state
+            # What is cached of an examination may follow from a rule.
+            return dataclasses.replace(answer) if isinstance(answer, Evidence) else answer
+
+        return remembering
+
+    with contextlib.ExitStack() as stack:
+        for owner, name in SLOW:
+            stack.enter_context(patch.object(owner, name, once(getattr(owner, name), name)))
+        yield
+
+
+def _identified(value: Any) -> Any:
+    """The fit that an examination or a design is about; anything else as it is."""
+    return value.fit if isinstance(value, Design) else value.result if isinstance(value, Evidence) else value
+
+
+def _key(value: Any) -> Any:
+    """What two equal arguments have in common."""
+    value = _identified(value)
+    if isinstance(value, np.random.Generator):
+        return str(value.bit_generator.state)
+    if isinstance(value, Effect):
+        return str(jax.tree.structure(value)), *(
+            np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(value)
+        )
+    if isinstance(value, Ranked):
+        return value.name, value.score.amplitudes.tobytes()
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, FitResult | Likelihood | CalibrationSet):
+        return id(value)
+    if isinstance(value, Mapping):
+        return tuple(value)
+    return value if isinstance(value, str | int | float) or value is None else type(value).__name__
+
+
+class Same(Exception):
+    """The search without a rule ends as with it."""
+
+
 class Fitted(NamedTuple):
     """The answer to a sealed set: verdict and names, are these right, error of the matrix, trusted and wrong."""
 
@@ -290,11 +366,26 @@ class Fitted(NamedTuple):
     wrong: bool
 
 
-def fitted(one: Any) -> Fitted:
-    """Diagnose a sealed set."""
+def fitted(one: Sealed, before: list[Any]) -> Fitted:
+    """Diagnose a sealed set; `before` has the end of its search with all rules, and then what came of it."""
+
+    def concluded(*args: Any) -> Any:
+        state, rest = real(*args)
+        end = state.evidence.result, rest and rest.description, *(step.name for step in state.steps)
+        if not before:
+            before.append(end)
+        elif end[0] is before[0][0] and end[1:] == before[0][1:] and workflow.instead_of_names is instead:
+            raise Same
+        return state, rest
+
+    real, instead = workflow.concluded, INSTEAD
     try:
-        diagnosis = workflow.diagnose(one.calset)
+        with patch.object(workflow, "concluded", concluded):
+            diagnosis = workflow.diagnose(one.calset)
+    except Same:
+        return before[1]
     except (DataError, ValueError) as error:
+        before += [] if before else [None]
         return Fitted(f"refused: {str(error)[:80]}", "", np.nan, False)
     trusted = diagnosis.after.trusted and diagnosis.verdict != "unexplained"
     product = judged(diagnosis.calibration(), trusted, one)
@@ -311,12 +402,19 @@ def fits(seed: int, first: int, budget: float, save: Path | None) -> list[dict[s
     rows, end, count = list[dict[str, Any]](), time.monotonic() + 60.0 * budget, first
     while time.monotonic() < end:
         one = sealed(count, seed, 8)
-        with watched(RULES) as decided:
-            row: dict[str, Any] = {"number": count, "hidden": one.text, "all": fitted(one), "rules": {}}
-        for rule in RULES:
-            if rule.text in decided:
+        with remembered():
+            before: list[Any] = []
+            with watched(RULES) as decided:
+                row: dict[str, Any] = {
+                    "number": count,
+                    "hidden": one.text,
+                    "all": fitted(one, before),
+                    "rules": {},
+                }
+            before.append(row["all"])
+            for rule in (rule for rule in RULES if rule.text in decided):
                 with without(rule):
-                    row["rules"][rule.text] = fitted(one)
+                    row["rules"][rule.text] = fitted(one, before)
         rows.append(row)
         changed = [text for text, now in row["rules"].items() if now.verdict != row["all"].verdict]
         print(

@@ -36,11 +36,11 @@ def _of_the_result(document: Document, name: str) -> Iterator[str]:
             return
     added = [turn["added"] for turn in document.get("rounds", ())]
     partial = (document.get("unexplained") or {}).get("parts", ())
-    if name in added and not any(text.startswith(name) for text in partial):
+    parts = [text for text in partial if text.startswith(f"{name} (")]
+    if name in added and not parts:
         yield "it was added, and taken out again: the final model does not need it"
-    for text in partial:
-        if text.startswith(name):
-            yield f"it explains a part only, and may imitate something else: {text}"
+    for text in parts:
+        yield f"it explains a part only, and may imitate something else: {text}"
 
 
 def _of_the_first_look(document: Document, name: str) -> Iterator[str]:
