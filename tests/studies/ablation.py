@@ -346,11 +346,19 @@ def _key(value: Any) -> Any:
         return value.name, value.score.amplitudes.tobytes()
     if isinstance(value, np.ndarray):
         return value.tobytes()
-    if isinstance(value, FitResult | Likelihood | CalibrationSet):
+    if isinstance(value, Likelihood):  # of one set, as a whole or thinned
+        parameters = ((p.name, p.free, p.prior, p.start) for p in value.model.parameters)
+        return len(value.calset.points), *map(str, parameters), *_key_of_tree(value.model.template)
+    if isinstance(value, FitResult | CalibrationSet):
         return id(value)
     if isinstance(value, Mapping):
         return tuple(value)
     return value if isinstance(value, str | int | float) or value is None else type(value).__name__
+
+
+def _key_of_tree(tree: Any) -> tuple[Any, ...]:
+    leaves, structure = jax.tree.flatten(tree)
+    return str(structure), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
 class Same(Exception):
@@ -374,7 +382,12 @@ def fitted(one: Sealed, before: list[Any]) -> Fitted:
         end = state.evidence.result, rest and rest.description, *(step.name for step in state.steps)
         if not before:
             before.append(end)
-        elif end[0] is before[0][0] and end[1:] == before[0][1:] and workflow.instead_of_names is instead:
+        elif (
+            before[0]
+            and end[0] is before[0][0]
+            and end[1:] == before[0][1:]
+            and workflow.instead_of_names is instead
+        ):
             raise Same
         return state, rest
 
