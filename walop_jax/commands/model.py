@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, design_of, set_of
-from walop_jax.commands.products import Effects, catalogue_of
+from walop_jax.commands.inputs import set_of
+from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, design_of
 from walop_jax.io.display import Display, Displayed
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, command, given, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, goal_of, paths_of, set_and_model
-from walop_jax.commands.products import IN_MEMORY, Effects
+from walop_jax.commands.inputs import ModelLike, Sets, goal_of, paths_of, set_and_model
+from walop_jax.commands.products import IN_MEMORY, Effects, InstrumentLike
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
 from walop_jax.io.names import FAILED, PRODUCT, SUMMARY

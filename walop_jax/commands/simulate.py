@@ -8,8 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, given, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, design_of
-from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, left_out_sentences
+from walop_jax.commands.products import (
+    Effects,
+    InstrumentLike,
+    Product,
+    calibration_of,
+    catalogue_of,
+    design_of,
+    left_out_sentences,
+)
 from walop_jax.io.atomic import check_output
 from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from walop_jax.commands.command import Job, Outcome, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike
+from walop_jax.commands.products import InstrumentLike
 
 LOWEST = 30.0  # deg
 

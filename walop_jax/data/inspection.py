@@ -12,8 +12,8 @@ import numpy as np
 
 from walop_jax.data.checks import like_radians
 from walop_jax.data.kinds import CALIBRATION_PLATE
-from walop_jax.data.records import CalibrationSet, DataFlag, Exposures
-from walop_jax.data.table_intensities import TableIntensities, sampled
+from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, sampled
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import shipped
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded

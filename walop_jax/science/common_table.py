@@ -28,7 +28,7 @@ from walop_jax.data.user_tables import InputTable, numeric_column, read_input_ta
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
-from walop_jax.sky.moon import sky_to_instrument
+from walop_jax.sky.position_angles import sky_to_instrument
 
 Vector = Float[np.ndarray, " n"]
 Pairs = Float[np.ndarray, "n 2"]
