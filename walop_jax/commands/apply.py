@@ -75,7 +75,7 @@ def apply(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.nights.stacking import is_survey
+    from walop_jax.nights.survey_folder import is_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
@@ -175,7 +175,7 @@ def calibration_for(
     given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
 ) -> Calibration:
     """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
+    from walop_jax.nights.survey_folder import calibration_of_stars, is_survey, read_survey
 
     if is_survey(given):
         return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
@@ -195,7 +195,7 @@ def _apply_to_each(
     A table appears whole or not at all, and one that is there is not made again: the same command goes on with what an
     interrupted one has left. Errors of a file fail the whole, which names them, after all others are made.
     """
-    from walop_jax.nights.making import executor_of, mapped
+    from walop_jax.likelihood.workers import executor_of, mapped
 
     if output is None:
         raise UsageError("a folder for the tables is wanted", "output")

@@ -50,9 +50,10 @@ def stack(
 
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
-    from walop_jax.nights.making import executor_of
-    from walop_jax.nights.stacking import PARTIAL, writers
+    from walop_jax.likelihood.workers import executor_of
+    from walop_jax.nights.stacking import PARTIAL
     from walop_jax.nights.stacking import stack as stacked
+    from walop_jax.nights.survey_folder import writers
 
     if workers is not None and scheduler is not None:
         raise UsageError("workers and scheduler exclude each other: a cluster has workers", "scheduler")
