@@ -79,6 +79,7 @@ def apply(
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
+    from walop_jax.science.common_table import in_common_form
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
 
@@ -124,7 +125,7 @@ def apply(
         output,
         counted=added.counted_flags(rows, used.model.template),
         warnings=warnings,
-        remade=_common if common else None,
+        remade=in_common_form if common else None,
         extra={
             "stars": len(stars.qu),
             "seconds": job.seconds,
@@ -160,15 +161,6 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
     instrument = None if held is None else held.design
     gathered = command_of(gather).run(Job(), {"catalogues": catalogue, "instrument": instrument})
     return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
-
-
-def _common(made: Any) -> tuple[Any, Sequence[str]]:
-    """The common table of what `apply` makes, and remarks: its faults, if it has any, among them."""
-    from walop_jax.data.user_tables import in_memory
-    from walop_jax.science.common_table import check_common_table, common_table
-
-    table, remarks = common_table(in_memory(made, "the result"))
-    return table, (*remarks, *check_common_table(table))
 
 
 def calibration_for(
@@ -236,6 +228,4 @@ def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:
             outcome = command_of(apply).run(Job(overwrite=overwrite), arguments)
     except (ValueError, OSError) as error:
         return Outcome(None, {}, "", failure=str(error))
-    return Outcome(
-        None, outcome.content, outcome.printed(), warnings=outcome.warnings, failure=outcome.failure
-    )
+    return dataclasses.replace(outcome, value=None)

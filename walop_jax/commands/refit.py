@@ -5,7 +5,16 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, given, typed, write_text
+from walop_jax.commands.command import (
+    Job,
+    Outcome,
+    PathLike,
+    after_fit,
+    command,
+    given,
+    typed,
+    write_text,
+)
 from walop_jax.commands.inputs import ModelLike, Sets, goal_of, paths_of, set_and_model
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.atomic import check_output
@@ -112,7 +121,7 @@ def refit(
 
 def next_steps(trusted: bool, output: Any, data: Sets, **options: object) -> tuple[str, ...]:
     """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
-    report = typed("report", output)
     if output is None or trusted:
-        return (report, typed("apply", output, "STARS.fits", "-o", "OUT.fits"))
-    return (report, typed("diagnose", *paths_of(data), *given(**options), "-o", f"{output}_diagnosis"))
+        return after_fit(output)
+    diagnose = typed("diagnose", *paths_of(data), *given(**options), "-o", f"{output}_diagnosis")
+    return (*after_fit(output, usable=False), diagnose)
