@@ -8,9 +8,9 @@ import pytest
 from astropy.io import fits
 from own_instrument import OWN
 
-from walop_jax.commands.inputs import design_of
 from walop_jax.commands.limits import limits
 from walop_jax.commands.plan import plan as plan_command
+from walop_jax.commands.products import design_of
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.write import write_calibration_set

@@ -13,7 +13,8 @@ from south_sets import CUTS, SouthSet
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import CalibrationSet, Exposures, Points
-from walop_jax.data.table_intensities import TableIntensities, repeated_counts
+from walop_jax.data.repeats import repeated_counts
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 
 COLUMNS = ("exposure", "point", "source", "counts", "sigma", "flag", "used")

@@ -14,12 +14,12 @@ from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.time import Time
 
 import walop_jax as walop
-from walop_jax.commands.command import Job
-from walop_jax.commands.plan import scheduled
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import Exposures, Position
 from walop_jax.data.schedule import read_schedule, schedule_of
 from walop_jax.io.errors import DataError
+from walop_jax.io.text import json_text
+from walop_jax.plans.schedule import scheduled
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 
 FILTERS = {"SDSS-r": 1, "NB-660": 3}
@@ -105,10 +105,10 @@ def test_a_plan_with_filters_plate_and_sky(tmp_path: Path):
     assert {target["type"] for target in schedule["targets"]} == {"CAL-CAL", "CAL-MOO", "CAL-POL"}
 
 
-def test_standards_of_a_schedule_are_stars_that_are_up(tmp_path: Path):
+def test_standards_of_a_schedule_are_stars_that_are_up():
     """Those of the package, zero or not as in the plan, at least 30° high by astropy; others are said to be none."""
-    remarks = "; ".join(scheduled(Job(), PLAN, tmp_path / "s.json", None))
-    schedule = json.loads((tmp_path / "s.json").read_text())
+    document, said = scheduled(PLAN, None, "s.json")
+    remarks, schedule = "; ".join(said), json.loads(json_text(document))
     validate(schedule)
     place = {
         one["name"]: SkyCoord(one["ra"], one["dec"], unit=("hourangle", "deg")) for one in schedule["objects"]

@@ -13,10 +13,10 @@ from walop_jax.io.errors import DataError
 from walop_jax.model.effects.change import Change
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights import breaks, night_file, stacking
+from walop_jax.nights import break_search, breaks, night_file, stacking, survey_folder
 from walop_jax.nights.algebra import Equations
-from walop_jax.nights.equations import EffectAmplitude, Night, Together, together
 from walop_jax.nights.survey import Survey
+from walop_jax.nights.together import EffectAmplitude, Night, Together, together
 
 N, NIGHTS, RATE = 6, 60, 0.05
 LAWS = (Law(("walk",), rate=RATE), Law(), Law(), Law(), Law(("night",), spread=0.2), None)
@@ -57,14 +57,14 @@ def test_two_deviates_beyond(u, rho):
         return stats.multivariate_normal.cdf(at, [0.0, 0.0], matrix, abseps=1e-15, releps=1e-9)
 
     wanted = 2.0 * (corner(rho) + corner(-rho))
-    assert breaks.both_beyond(u, np.array([rho]))[0] == pytest.approx(wanted, rel=1e-4)
+    assert break_search.both_beyond(u, np.array([rho]))[0] == pytest.approx(wanted, rel=1e-4)
 
 
 def test_the_largest_of_quiet_series_is_as_the_bound_says():
     """A hundred series in which things walk: never more than the bound by more than chance, and not far below it."""
     largest = []
     for seed in range(100):
-        tried = breaks.Tried.of(breaks.solved(series(seed), LAWS))
+        tried = break_search.Tried.of(breaks.solved(series(seed), LAWS))
         largest.append(max(np.abs(tried.z(kind)).max() for kind in range(3)))
     for u in (3.4, 3.8):
         beyond, most = np.sum(np.array(largest) > u), tried.chance(u)
@@ -80,12 +80,12 @@ def test_the_bound_of_three_nights_is_a_bound(u):
     data = dataclasses.replace(
         series(0), equations=e, mean=no[0], width=no[0] + np.inf, parameters=series(0).parameters[4:]
     )
-    tried = breaks.Tried.of(breaks.solved(data, (Law(), None)), barred=[0])
+    tried = break_search.Tried.of(breaks.solved(data, (Law(), None)), barred=[0])
     single = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [-1, 0, 1]]) / np.sqrt(
         [[1], [1], [1], [2], [2]]
     )
     correlation = single @ single.T
-    both = breaks.both_beyond(u, correlation[np.triu_indices(5, 1)])
+    both = break_search.both_beyond(u, correlation[np.triu_indices(5, 1)])
     total = 5.0 * 2.0 * stats.norm.sf(u)
     assert total - both.sum() < tried.chance(u) < total
 
@@ -96,7 +96,7 @@ def test_a_step_a_bad_night_and_a_drift():
     change[40:, 5], change[20, 1] = 1.2, 2.0
     change[:, 3] = 12.0 * np.linspace(-0.15, 0.15, NIGHTS)
     data = series(7, change)
-    found, laws = breaks.find(data, LAWS, ())
+    found, laws = break_search.find(data, LAWS, ())
     kinds = {one.kind: one for one in found}
     assert sorted(kinds) == ["bad night", "drift", "step"]
     step, bad = kinds["step"], kinds["bad night"]
@@ -112,22 +112,22 @@ def test_a_step_a_bad_night_and_a_drift():
     drift = kinds["drift"]
     assert {drift.name, *drift.alike} >= {"p2.x", "p3.x"}
     assert drift.nights_needed > NIGHTS
-    assert breaks.find(data, laws, ())[0] == ()
+    assert break_search.find(data, laws, ())[0] == ()
 
 
 def test_of_names_that_explain_a_break_alike_one_that_stars_can_be_corrected_for_is_its_law():
     change = np.zeros((NIGHTS, N))
     change[:, 3] = 12.0 * np.linspace(-0.15, 0.15, NIGHTS)
     data = series(7, change)
-    (first,) = breaks.find(data, LAWS, ())[0]
+    (first,) = break_search.find(data, LAWS, ())[0]
     assert first.alike
-    (second,), laws = breaks.find(data, LAWS, (), lambda parameter: parameter.name != first.name)
+    (second,), laws = break_search.find(data, LAWS, (), lambda parameter: parameter.name != first.name)
     assert second.name in first.alike
     assert first.name in second.alike
-    assert second.z**2 > first.z**2 - breaks.RIVAL
+    assert second.z**2 > first.z**2 - break_search.RIVAL
     assert laws[data.names.index(second.name)].per != laws[data.names.index(first.name)].per
     # Without one that is, the best keeps it.
-    (third,) = breaks.find(data, LAWS, (), lambda name: False)[0]
+    (third,) = break_search.find(data, LAWS, (), lambda name: False)[0]
     assert third.name == first.name
 
 
@@ -135,7 +135,7 @@ def test_a_break_beside_a_value_for_every_file_is_held_against_other_nights():
     """The nights that are left out are files that are left out."""
     change = np.zeros((NIGHTS, N))
     change[40:, 5] = 1.2
-    (step,) = breaks.find(series(7, change), (*LAWS[:4], Law(("file",), spread=0.2), None), ())[0]
+    (step,) = break_search.find(series(7, change), (*LAWS[:4], Law(("file",), spread=0.2), None), ())[0]
     assert (step.kind, step.name) == ("step", "p5.x")
     assert step.held_out > 0
 
@@ -166,8 +166,11 @@ def test_a_model_holds_one_shape_of_an_effect():
     nights = tuple(dataclasses.replace(n, parameters=parameters, candidates=4) for n in one.nights)
     data = dataclasses.replace(one, nights=nights, parameters=nights[0].parameters, candidates=4)
     laws = (Law(), Law(), None, Law(("night",)), None, None)
-    assert breaks._other_shapes(data, laws) == [names.index("cut#0.angle"), names.index("ghost#1.depth")]
-    assert breaks._other_shapes(data, (Law(), Law(), None, None, None, None)) == [
+    assert break_search._other_shapes(data, laws) == [
+        names.index("cut#0.angle"),
+        names.index("ghost#1.depth"),
+    ]
+    assert break_search._other_shapes(data, (Law(), Law(), None, None, None, None)) == [
         names.index("ghost#1.depth")
     ]
 
@@ -179,7 +182,7 @@ def test_the_size_of_a_step_between_two_intervals_is_the_difference_of_their_val
     data = series(7, change)
     middle = 0.5 * (data.nights[10].end + data.nights[11].begin)
     for law in (Law(), Law(("interval",), at=(middle,))):
-        (step,), laws = breaks.find(data, (LAWS[0], law, *LAWS[2:]), ())
+        (step,), laws = break_search.find(data, (LAWS[0], law, *LAWS[2:]), ())
         one = breaks.at_solution(data, breaks.solved(data, laws), step)
         assert (one.kind, one.name) == ("step", "p1.x")
         assert abs(one.size - 1.2) < 4.0 * one.error
@@ -253,7 +256,7 @@ def test_stars_of_two_nights_with_values_of_their_own_are_refused():
     survey, night, other = nightly()
     stars = in_memory({"MJD": [night.end + 0.1, other.begin - 0.01]})
     with pytest.raises(DataError, match=r"MJD.*spans two nights.*give a catalogue for every night"):
-        stacking.calibration_of_stars(survey, stars)
+        survey_folder.calibration_of_stars(survey, stars)
 
 
 def test_a_night_is_not_far_from_what_it_does_not_see():
@@ -269,7 +272,7 @@ def test_a_night_is_not_far_from_what_it_does_not_see():
             gradient=night.gradient[keep], matrix=night.matrix[np.ix_(keep, keep)],
         )  # fmt: skip
     data = together(nights)
-    laws = [law and Law() for law in stacking.laws_of_all(data, {})]
+    laws = [law and Law() for law in survey_folder.laws_of_all(data, {})]
     at_hand = dict.fromkeys((night.key for night in data.nights), stacking.Data(None, ""))
     away = stacking._distances(data, breaks.solved(data, laws), data.reference, at_hand)
     assert max(away[k] for k in blind) < 20.0 < 200.0 < min(away[k] for k in range(1, NIGHTS, 2))

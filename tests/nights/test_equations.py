@@ -19,13 +19,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights import equations, night_file
-from walop_jax.nights.equations import (
-    data_hash,
-    model_hash,
-    night_equations,
-    together,
-    with_candidates_of,
-)
+from walop_jax.nights.equations import data_hash, model_hash, night_equations, with_candidates_of
+from walop_jax.nights.together import check_together, together
 from walop_jax.simulation.simulate import simulate
 from walop_jax.sky.nights import night_of
 
@@ -96,7 +91,7 @@ def test_nights_that_overlap_are_refused(nights):
         first, number=first.number + 1, begin=first.begin + 0.01, end=first.end + 0.01, sha256="other"
     )
     with pytest.raises(DataError, match=r"overlap: .* \(SITELONG"):
-        equations.check_together([first, other])
+        check_together([first, other])
 
 
 def test_nights_without_a_longitude_are_asked_for_too(monkeypatch):

@@ -17,10 +17,10 @@ import walop_jax as walop
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
+from walop_jax.likelihood import workers
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.nights import making
+from walop_jax.likelihood.workers import executor_of
 from walop_jax.nights.equations import SIDEREAL
-from walop_jax.nights.making import executor_of
 from walop_jax.nights.stacking import stack
 from walop_jax.simulation.simulate import simulate
 
@@ -71,11 +71,11 @@ def test_threads_make_the_same_survey(given, here, tmp_path):
 def test_another_process_is_set_up_as_a_command_is(monkeypatch):
     """Without kept programs every worker would compile its own, for as long as twenty nights take."""
     switched = []
-    monkeypatch.setattr(making, "switch_on", lambda: switched.append(True))
-    making._prepare.cache_clear()
-    making._prepare(os.getpid(), ())
+    monkeypatch.setattr(workers, "switch_on", lambda: switched.append(True))
+    workers._prepare.cache_clear()
+    workers._prepare(os.getpid(), ())
     assert not switched
-    making._prepare(-1, ())
+    workers._prepare(-1, ())
     assert switched
 
 

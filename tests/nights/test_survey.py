@@ -22,7 +22,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Deviations, effect_by_name
 from walop_jax.model.specification import effect_context, make_model, with_effects
-from walop_jax.nights import making, night_file, stacking
+from walop_jax.nights import making, night_file, stacking, survey_folder
 from walop_jax.nights.equations import night_equations
 from walop_jax.nights.stacking import stack
 from walop_jax.science import apply as application
@@ -312,7 +312,7 @@ def kept(sets, single, tmp_path_factory):
 
 def test_the_program_stacks_what_python_does(kept, sets, single, monkeypatch):
     """Resumed, from a run and two sets in another order, with the law of the model file; as if they were many."""
-    survey = stacking.read_survey(kept / "SURVEY")
+    survey = survey_folder.read_survey(kept / "SURVEY")
     monkeypatch.setattr(stacking, "Maker", lambda like, folder, count: making.Maker(like, folder, 1000))
     laws = {"throughput.n1.p00": {"per": "walk", "rate": 1e-4}}
     other = stack([single, *sets[1:3]], laws)
@@ -342,7 +342,7 @@ def test_stars_get_the_calibration_of_their_moment(kept, monkeypatch):
         return tables[key]
 
     monkeypatch.setattr(application, "AnalysisVectors", tabulated)  # those of the same values are the same
-    survey = stacking.read_survey(kept / "SURVEY")
+    survey = survey_folder.read_survey(kept / "SURVEY")
     counts = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
     stars = {"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": counts, "N_ERR": np.sqrt(counts)}
     start, stop = survey.span

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.commands.conformance import RESULTS, SHIPPED, conformance
+from walop_jax.commands.conformance import conformance
 from walop_jax.io.errors import DataError
 from walop_jax.model.mueller import retarder
 from walop_jax.model.sources import turned
 from walop_jax.science import conformance as science
-from walop_jax.science.conformance import rows, values
+from walop_jax.science.conformance import RESULTS, SHIPPED, rows, values
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation
 

@@ -18,14 +18,8 @@ from science.truth import TrueInstrument
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import Site
 from walop_jax.io.errors import DataError
-from walop_jax.sky.moon import (
-    body_direction,
-    local_sidereal_time,
-    moon_sky,
-    offset_direction,
-    rayleigh_sky,
-    sky_to_instrument,
-)
+from walop_jax.sky.moon import body_direction, local_sidereal_time, moon_sky, offset_direction, rayleigh_sky
+from walop_jax.sky.position_angles import sky_to_instrument
 
 CENTRE = (np.zeros(1), np.zeros(1))
 

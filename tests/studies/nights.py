@@ -46,11 +46,13 @@ from walop_jax.fit.refit import fit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.laws import YEAR, Law  # noqa: E402
 from walop_jax.model.specification import effect_context  # noqa: E402
-from walop_jax.nights import breaks, changes  # noqa: E402
-from walop_jax.nights.equations import Night, Together, night_equations, together  # noqa: E402
+from walop_jax.nights import break_search, breaks, changes  # noqa: E402
+from walop_jax.nights.equations import night_equations  # noqa: E402
 from walop_jax.nights.night_file import read_nights, write_nights  # noqa: E402
-from walop_jax.nights.stacking import laws_of_all, stack  # noqa: E402
+from walop_jax.nights.stacking import stack  # noqa: E402
 from walop_jax.nights.survey import Survey  # noqa: E402
+from walop_jax.nights.survey_folder import laws_of_all  # noqa: E402
+from walop_jax.nights.together import Night, Together, together  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan  # noqa: E402
 from walop_jax.simulation.simulate import effect_from_text, simulate, truth_values  # noqa: E402
 
@@ -66,9 +68,9 @@ CHANGING = (
 """Parameters that change in the series of `smallest` and `stars`."""
 
 
-def alarm_of(tried: breaks.Tried) -> float:
+def alarm_of(tried: break_search.Tried) -> float:
     """The |z| from which a change is a break."""
-    return float(optimize.brentq(lambda u: tried.chance(u) - breaks.CHANCE, 3.0, 12.0, xtol=1e-3))
+    return float(optimize.brentq(lambda u: tried.chance(u) - break_search.CHANCE, 3.0, 12.0, xtol=1e-3))
 
 
 def cpu() -> float:
@@ -140,7 +142,7 @@ def quiet(count: int, start: int = 0, nights: int = 1000) -> None:
     days = days_of(nights, rng)
     data = together(nights_at(walked(days, rng), days, rng))
     solution = breaks.solved(data, laws_of_all(data, LAWS))
-    tried, largest = breaks.Tried.of(solution), []
+    tried, largest = break_search.Tried.of(solution), []
     for _ in range(40):
         once = null_scores(solution, count, rng)
         every = (np.cumsum(once[::-1], axis=0)[::-1], once)
@@ -227,14 +229,14 @@ def sealed(count: int, start: int = 0, nights: int = 200) -> None:
         last = first + 1 if bad else nights
         plain = together(nights_at(truth, days, rng))
         laws = laws_of_all(plain, LAWS)
-        alarm = alarm or alarm_of(breaks.Tried.of(breaks.solved(plain, laws)))
+        alarm = alarm or alarm_of(break_search.Tried.of(breaks.solved(plain, laws)))
         known = 0.0
         while not known > 0.0:
             name = str(rng.choice(names))
             known = information(plain, laws, names.index(name), first, last)
         expected = float(rng.uniform(5.0, 15.0))
         truth[first:last, names.index(name)] += rng.choice([-1.0, 1.0]) * expected / np.sqrt(known)
-        found, _ = breaks.find(together(nights_at(truth, days, rng)), laws)
+        found, _ = break_search.find(together(nights_at(truth, days, rng)), laws)
         band = 0 if expected < 7.0 else 1 if expected < 8.0 else 2
         number = np.array([int(START + day) for day in days])
         at = [int(np.searchsorted(number, one.night)) for one in found]
@@ -328,7 +330,7 @@ def smallest(count: int, start: int = 0, nights: int = 200) -> None:
         plain = together(nights_at(truth, days, rng))
         laws = laws_of_all(plain, LAWS)
         one = 1.0 / np.sqrt(information(plain, laws, i, middle, nights))
-        alarm = alarm_of(breaks.Tried.of(breaks.solved(plain, laws)))
+        alarm = alarm_of(break_search.Tried.of(breaks.solved(plain, laws)))
         sigma = float(np.median(tracks(truth[:6], days[:6])[1][:, i]))
         ours, person = alarm * one, 3.0 * np.sqrt(2.0) * sigma
         found, theirs = [], np.nan

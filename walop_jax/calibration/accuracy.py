@@ -17,6 +17,10 @@ GOAL = 0.001
 """Error of p that instruments are built for."""
 SMALLEST_DETERMINANT = 0.1
 """|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
+SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
+SIZE = 21  # points along each axis of a map of the field
+NODES = (10, 14, 20, 28)
+TOLERANCE = 1e-2  # relative, of errors that are given with two digits
 
 
 def sample_stars(count: int = STARS, seed: int = 0) -> Float[np.ndarray, "n 2"]:
@@ -54,6 +58,17 @@ def p_forms(
 def measures_u(matrix: Float[np.ndarray, "p 2 3"]) -> Bool[np.ndarray, " p"]:
     """Places where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
     return np.abs(np.linalg.det(matrix[:, :, 1:])) >= SMALLEST_DETERMINANT
+
+
+def reached(error: Float[np.ndarray, "*p"]) -> float:
+    """The error that `SHARE` of some places stay below; NaN without a place."""
+    return float(np.quantile(error, SHARE)) if error.size else np.nan
+
+
+def judged(without_u: float) -> str:
+    """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
+    field = f"{100 * SHARE:.0f} % of the field"
+    return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 
 
 def change_of_qu(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> Float[np.ndarray, " p"]:

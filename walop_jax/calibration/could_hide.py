@@ -28,7 +28,7 @@ from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrice
 from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
 from walop_jax.likelihood.field_table import Vector
-from walop_jax.model import light, slots
+from walop_jax.model import light
 from walop_jax.model.effects import Change, Effect, effect_by_name, in_order
 from walop_jax.model.effects.numbers import OF_POLARISER
 from walop_jax.model.instrument import Instrument
@@ -160,7 +160,7 @@ def _changes(effect: Effect, instrument: Instrument) -> list[Change]:
 def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     """Column prefixes of the moving elements that an effect depends on: it vanishes where these are out."""
     bare = dataclasses.replace(instrument, effects=())
-    elements = itertools.chain(*slots.trains(bare.patched()).values())
+    elements = bare.patched().by_place().values()
     moving = {element.name: element.moves for element in elements if element.moves is not None}
     prefixes: set[str] = set()
     for change in _changes(effect, bare):

@@ -75,10 +75,11 @@ def apply(
     from walop_jax.fit.verdict import Quality
     from walop_jax.io.atomic import check_output
     from walop_jax.io.plain_tables import table_format
-    from walop_jax.nights.stacking import is_survey
+    from walop_jax.nights.survey_folder import is_survey
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
+    from walop_jax.science.common_table import in_common_form
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
 
@@ -124,7 +125,7 @@ def apply(
         output,
         counted=added.counted_flags(rows, used.model.template),
         warnings=warnings,
-        remade=_common if common else None,
+        remade=in_common_form if common else None,
         extra={
             "stars": len(stars.qu),
             "seconds": job.seconds,
@@ -162,20 +163,11 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
     return in_memory(gathered.value, "stars of the cameras"), gathered.warnings
 
 
-def _common(made: Any) -> tuple[Any, Sequence[str]]:
-    """The common table of what `apply` makes, and remarks: its faults, if it has any, among them."""
-    from walop_jax.data.user_tables import in_memory
-    from walop_jax.science.common_table import check_common_table, common_table
-
-    table, remarks = common_table(in_memory(made, "the result"))
-    return table, (*remarks, *check_common_table(table))
-
-
 def calibration_for(
     given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
 ) -> Calibration:
     """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
-    from walop_jax.nights.stacking import calibration_of_stars, is_survey, read_survey
+    from walop_jax.nights.survey_folder import calibration_of_stars, is_survey, read_survey
 
     if is_survey(given):
         return calibration_of_stars(read_survey(given, catalogue_of(effects)), stars, force=force)
@@ -195,7 +187,7 @@ def _apply_to_each(
     A table appears whole or not at all, and one that is there is not made again: the same command goes on with what an
     interrupted one has left. Errors of a file fail the whole, which names them, after all others are made.
     """
-    from walop_jax.nights.making import executor_of, mapped
+    from walop_jax.likelihood.workers import executor_of, mapped
 
     if output is None:
         raise UsageError("a folder for the tables is wanted", "output")
@@ -236,6 +228,4 @@ def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:
             outcome = command_of(apply).run(Job(overwrite=overwrite), arguments)
     except (ValueError, OSError) as error:
         return Outcome(None, {}, "", failure=str(error))
-    return Outcome(
-        None, outcome.content, outcome.printed(), warnings=outcome.warnings, failure=outcome.failure
-    )
+    return dataclasses.replace(outcome, value=None)

@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
+from walop_jax.commands.command import Job, Outcome, PathLike, after_fit, command
 from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
 from walop_jax.io.names import COMMISSIONING, PRODUCT
@@ -71,5 +71,5 @@ def certify(
         saved_as=COMMISSIONING,
         failure=failed and f"{path}: not valid: {failed}",
         trusted=certificate.go,
-        next=(typed("apply", calibration, "STARS.fits", "-o", "OUT.fits"),) if certificate.go else (),
+        next=after_fit(calibration)[1:] if certificate.go else (),
     )

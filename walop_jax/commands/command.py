@@ -151,6 +151,12 @@ def typed(*words: object) -> str:
     return shlex.join(("walop-jax", *map(str, words))) if can_be else ""
 
 
+def after_fit(folder: object, *, usable: bool = True) -> tuple[str, ...]:
+    """Command lines to type after a fit: its page, and stars corrected with it if it is `usable`."""
+    stars = typed("apply", folder, "STARS.fits", "-o", "OUT.fits")
+    return (typed("report", folder), stars) if usable else (typed("report", folder),)
+
+
 def given(**options: object) -> list[object]:
     """The words by which options are given; those that are None are left out."""
     return [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands import products
 from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, set_and_model, set_of
-from walop_jax.commands.products import Effects, Product
+from walop_jax.commands.inputs import ModelLike, Sets, set_and_model, set_of
+from walop_jax.commands.products import Effects, InstrumentLike, Product
 from walop_jax.io.errors import fail
 from walop_jax.io.names import COMPARISON
 

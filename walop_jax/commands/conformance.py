@@ -10,9 +10,6 @@ from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, comma
 if TYPE_CHECKING:
     from walop_jax.science.conformance import Conformance
 
-SHIPPED = ("cases.csv", "given.csv", "answers.csv", "README.txt")
-RESULTS = "results.csv"
-
 
 @command(jax=False, writes=())
 def conformance(
@@ -28,18 +25,12 @@ def conformance(
 
     >>> walop.conformance(make="pack")  # doctest: +SKIP
     """
-    from walop_jax.io.folder import output_folder
-    from walop_jax.science.conformance import PACK, answers_of, judge, values
+    from walop_jax.science.conformance import RESULTS, answers_of, judge, write_pack
 
     if (make is None) == (check is None):
         raise UsageError("give either --make FOLDER or --check FOLDER")
     if make is not None:
-        with output_folder(make, (*SHIPPED, RESULTS), overwrite=job.overwrite) as out, out.filled() as folder:
-            for name in SHIPPED:
-                (folder / name).write_text((PACK / name).read_text("utf-8"), encoding="utf-8")
-            blank = "".join(f"{case},{quantity},\n" for case, quantity in values("answers.csv"))
-            (folder / RESULTS).write_text(f"CASE,QUANTITY,VALUE\n{blank}", encoding="utf-8")
-        number = len({case for case, _ in values("answers.csv")})
+        number = write_pack(make, overwrite=job.overwrite)
         return Outcome(number, {"output": str(make), "cases": number}, f"{number} questions: {make}")
     assert check is not None
     judged = judge(answers_of(Path(check) / RESULTS))

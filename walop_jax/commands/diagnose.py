@@ -6,9 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, typed
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
-from walop_jax.commands.products import Effects
+from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, after_fit, command
+from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
+from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.folder import output_folder
 from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
 from walop_jax.io.progress import repeated
@@ -100,7 +100,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
         saved_as=DIAGNOSIS,
         warnings=after.warnings,
         trusted=usable,
-        next=(typed("report", output), *[typed("apply", output, "STARS.fits", "-o", "OUT.fits")] * usable),
+        next=after_fit(output, usable=usable),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
@@ -27,24 +26,14 @@ def exposures(
 
     >>> walop.exposures(["night/0001.fits", "night/0002.fits"], words="words.toml")  # doctest: +SKIP
     """
-    from walop_jax.data.header_words import exposures_table, json_content, read_words
-    from walop_jax.data.schedule import is_schedule, read_schedule
-    from walop_jax.data.schema import EXPOSURES
-    from walop_jax.io.plain_tables import astropy_table, write_table
+    from walop_jax.data.header_words import read_words
+    from walop_jax.data.schedule import exposures_as_table, read_exposures
+    from walop_jax.io.plain_tables import write_table
 
     if words is None:
         raise UsageError("give the file that assigns words to columns", "words")
-    paths = several(files)
-    rules = read_words(words)
-    single = len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json"
-    content = json_content(paths[0]) if single else None
-    if is_schedule(content):
-        columns, remarks = read_schedule(paths[0], rules.filters, content)
-    else:
-        columns, remarks = exposures_table(paths, rules, content)
-    units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}
-    units |= {name: rule.unit for name, rule in EXPOSURES.items()}
-    table = astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})
+    columns, remarks = read_exposures(several(files), read_words(words))
+    table = exposures_as_table(columns)
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
     document = {"output": output, "exposures": len(table), "columns": table.colnames, "remarks": remarks}

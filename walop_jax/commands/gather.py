@@ -6,15 +6,10 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed
-from walop_jax.commands.inputs import InstrumentLike, design_of
-from walop_jax.io.errors import fail
-
-if TYPE_CHECKING:
-    from walop_jax.data.camera_catalogues import CameraCatalogue
-    from walop_jax.sky.directions import Pointing
+from walop_jax.commands.products import InstrumentLike, design_of
 
 
 @command(stages=("reading", "matching", "writing"), writes="table", jax=False)
@@ -49,7 +44,7 @@ def gather(
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.gathering import gather as gathered
-    from walop_jax.science.gathering import identified
+    from walop_jax.science.gathering import identified, pointing_of
 
     catalogues = several(catalogues)
     design = design_of(instrument) or nominal_instrument()
@@ -64,7 +59,7 @@ def gather(
     job.begin("reading")
     rules = None if words is None else read_words(words)
     cameras = [read_camera_catalogue(path, columns, gain, rules) for path in catalogues]
-    pointing, pointing_remarks = _pointing(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
+    pointing, pointing_remarks = pointing_of(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
     job.begin("matching")
     gathered_stars = gathered(cameras, names, pointing, tolerance)
     if gaia is not None:
@@ -95,31 +90,3 @@ def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
         if len(stated) == 1 and name.upper() not in stated:
             order = f"the order is {', '.join(names)}; rename it if it is of {name}"
             raise UsageError(f"{path} is given in the place of camera {name}: {order}", "catalogues")
-
-
-def _pointing(
-    catalogues: Sequence[CameraCatalogue], given: dict[str, float | None]
-) -> tuple[Pointing, list[str]]:
-    """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last."""
-    from walop_jax.data.camera_catalogues import angle_of, centre_of
-    from walop_jax.sky.directions import Pointing
-
-    first, remarks = catalogues[0], []
-    numbers = {name: angle_of(first, name) if value is None else value for name, value in given.items()}
-    missing = [name for name, value in numbers.items() if value is None]
-    if missing:
-        from_wcs = centre_of(first.header)
-        if from_wcs is None:
-            what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
-            advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
-            raise fail(what, file=first.path, advice=advice)
-        numbers |= {name: from_wcs[name] for name in missing}
-        stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
-        remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
-    values = {name: float(value) for name, value in numbers.items() if value is not None}
-    for name, value in values.items():
-        limit = 90.0 if name == "DEC" else 360.0
-        if not abs(value) <= limit:
-            what = f"{name} of the field centre is {value:g} deg"
-            raise fail(what, file=first.path, advice=f"at most {limit:g} deg")
-    return Pointing(*values.values()), remarks

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 from walop_jax.commands.command import PathLike, UsageError, several
-from walop_jax.commands.products import Effects, calibration_of, catalogue_of, is_product, path_of
+from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, design_of, path_of
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.folder import output_folder
 from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT, SUMMARY
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 Sets: TypeAlias = "CalibrationSet | PathLike | Sequence[PathLike]"
 ModelLike: TypeAlias = "Model | PathLike | None"
-InstrumentLike: TypeAlias = "Instrument | PathLike | None"
 
 
 def read(
@@ -60,19 +59,6 @@ def read(
     if len(paths) == 1 and "PRODVERS" in primary_keywords(first):
         return read_calibration(first, catalogue_of(effects))
     return read_calibration_set(*paths, kinds=kinds)
-
-
-def design_of(instrument: InstrumentLike) -> Instrument | None:
-    """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
-    from walop_jax import Instrument
-    from walop_jax.model.elements.registry import defined_elements
-
-    if instrument is None or isinstance(instrument, Instrument):
-        return instrument
-    path = path_of(instrument, "an instrument", "its name, its description file, or an Instrument")
-    if is_product(path):
-        return calibration_of(path).design
-    return Instrument.read(instrument, elements=defined_elements())
 
 
 def paths_of(data: Sets) -> tuple[PathLike, ...]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, paths_of, set_and_model
-from walop_jax.commands.products import Effects, catalogue_of, fit_of
+from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
+from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, fit_of
 from walop_jax.io.names import LIMITS, PRODUCT
 
 if TYPE_CHECKING:

@@ -2,40 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, design_of, set_of
-from walop_jax.commands.products import Effects, catalogue_of
-from walop_jax.io.display import Display, Displayed
+from walop_jax.commands.inputs import set_of
+from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, design_of
 
 if TYPE_CHECKING:
-    from walop_jax import CalibrationSet, Model
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ModelFile(Displayed):
-    """A model, its TOML text, and the file that it was written to (None: to no file)."""
-
-    model: Model
-    text: str
-    path: Path | None
-
-    def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        keys, model = ("start", "unit", "prior", "free", "tie", "about"), self.model
-        document = {"instrument": model.name, "effects": list(model.effect_names)}
-        document |= {"output": None if self.path is None else str(self.path)}
-        return document | {"parameters": {p.name: {k: getattr(p, k) for k in keys} for p in model.parameters}}
-
-    def display(self) -> Display:
-        """Its file and its size."""
-        where = self.model.name if self.path is None else self.path
-        parameters, free = len(self.model.parameters), len(self.model.free)
-        return Display(f"{where}: {parameters} parameters, {free} of them free")
+    from walop_jax import CalibrationSet
+    from walop_jax.fit.base_model import ModelFile
 
 
 @command(writes="file")
@@ -57,7 +34,7 @@ def model(
 
     >>> text = walop.model(instrument="WALOP-NORTH")  # doctest: +SKIP
     """
-    from walop_jax.fit.base_model import model_for
+    from walop_jax.fit.base_model import ModelFile, model_for
     from walop_jax.fit.model_file import effects_text, model_without_data, render
     from walop_jax.model.instrument import nominal_instrument
 

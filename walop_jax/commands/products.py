@@ -1,4 +1,4 @@
-"""Calibrations as arguments of commands.
+"""Calibrations and instruments as arguments of commands.
 
 A calibration may be given in memory, by its file or by the folder of a run. What is given in place of one of them is a
 TypeError that names its type and the types wanted.
@@ -18,7 +18,7 @@ from walop_jax.fit.parameter_table import Fitted
 from walop_jax.io.text import in_ascii
 
 if TYPE_CHECKING:
-    from walop_jax import Calibration, FitResult, Run
+    from walop_jax import Calibration, FitResult, Instrument, Run
     from walop_jax.diagnosis.findings import Diagnosis
     from walop_jax.model.effects import EffectKind
     from walop_jax.posterior.result import PosteriorSample
@@ -33,6 +33,7 @@ Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
 Fit: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
 Product: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
 Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
+InstrumentLike: TypeAlias = "Instrument | PathLike | None"
 Angles: TypeAlias = "Mapping[str, float] | Sequence[str] | None"
 
 
@@ -80,6 +81,19 @@ def folder_of(run: Run | PathLike) -> Path:
 def is_product(path: PathLike) -> bool:
     """True for the folder of a run, and for a file that can be a calibration by its name."""
     return Path(path).is_dir() or Path(path).suffix == ".fits"
+
+
+def design_of(instrument: InstrumentLike) -> Instrument | None:
+    """The instrument as designed: as given, or read, also from a run or a product; None if nothing was given."""
+    from walop_jax import Instrument
+    from walop_jax.model.elements.registry import defined_elements
+
+    if instrument is None or isinstance(instrument, Instrument):
+        return instrument
+    path = path_of(instrument, "an instrument", "its name, its description file, or an Instrument")
+    if is_product(path):
+        return calibration_of(path).design
+    return Instrument.read(instrument, elements=defined_elements())
 
 
 def angles_of(at: Mapping[str, float] | Sequence[str] | None) -> dict[str, float]:

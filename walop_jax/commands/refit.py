@@ -5,17 +5,25 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, given, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, ModelLike, Sets, goal_of, paths_of, set_and_model
-from walop_jax.commands.products import IN_MEMORY, Effects
+from walop_jax.commands.command import (
+    Job,
+    Outcome,
+    PathLike,
+    after_fit,
+    command,
+    given,
+    typed,
+    write_text,
+)
+from walop_jax.commands.inputs import ModelLike, Sets, goal_of, paths_of, set_and_model
+from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.atomic import check_output
-from walop_jax.io.errors import fail
 from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
 from walop_jax.io.progress import Stage, repeated
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
-    from walop_jax import CalibrationSet, FitResult
+    from walop_jax import FitResult
 
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
@@ -63,7 +71,7 @@ def refit(
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.calibration.summary import summary
     from walop_jax.data.write import write_calibration_set
-    from walop_jax.diagnosis.trust import examined
+    from walop_jax.diagnosis.trust import examined, stand_in
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.refit import refit as fit
     from walop_jax.science.field_accuracy import answered
@@ -78,7 +86,7 @@ def refit(
         say(Stage("looking for patterns in the residuals", "examining"))
         result = answered(examined(fitted, job.seed), goal=wanted)
     if compress is not None and result.converged:
-        write_calibration_set(compress, _compressed(result), overwrite=job.overwrite)
+        write_calibration_set(compress, stand_in(result), overwrite=job.overwrite)
     mapped = output is not None and result.likelihood.layout.large and result.converged
     residuals = residual_map(result) if mapped else None
     misfit = describe(result) if output is not None and not result.explains_data else None
@@ -111,26 +119,9 @@ def refit(
     return dataclasses.replace(outcome, text="", warnings=(), failure=failure, files={}, saved_as="")
 
 
-def _compressed(result: FitResult) -> CalibrationSet:
-    """The set of some hundred field points that stands for whole frames. Raises `DataError` for other data."""
-    from walop_jax.diagnosis.trust import pixel_structure
-    from walop_jax.fit.stand_in import with_pixel_structure
-    from walop_jax.likelihood.compressed import compressed
-    from walop_jax.likelihood.frames import PixelExpansion
-
-    if not isinstance(result.expansion, PixelExpansion):
-        where = result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY
-        advice = (
-            "only whole frames of many pixels can, under a model that is smooth over the field, with detectors that "
-            "report counts as they are; tables and small frames are small enough as they are"
-        )
-        raise fail("cannot be compressed", file=where, advice=advice)
-    return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
-
-
 def next_steps(trusted: bool, output: Any, data: Sets, **options: object) -> tuple[str, ...]:
     """Command lines to type after a fit; `options` are those that a diagnosis of the sets needs as well."""
-    report = typed("report", output)
     if output is None or trusted:
-        return (report, typed("apply", output, "STARS.fits", "-o", "OUT.fits"))
-    return (report, typed("diagnose", *paths_of(data), *given(**options), "-o", f"{output}_diagnosis"))
+        return after_fit(output)
+    diagnose = typed("diagnose", *paths_of(data), *given(**options), "-o", f"{output}_diagnosis")
+    return (*after_fit(output, usable=False), diagnose)

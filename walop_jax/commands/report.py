@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, write_text
 from walop_jax.commands.inputs import goal_of, save
 from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
 from walop_jax.io.atomic import check_output
-from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import encodable
 
+if TYPE_CHECKING:
+    from walop_jax.reports.page import Page
+
 PAGE = "report.html"
-GENERATOR = '<meta name="generator" content="walop-jax'
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class Page(Displayed):
-    """A page that was written: where, its length in bytes, and in words the files that the run lacked for it."""
-
-    path: Path
-    length: int
-    missing: tuple[str, ...]
-
-    def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
-        return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
-
-    def display(self) -> Display:
-        """Its file and size, and the files that the run lacked for it."""
-        return Display(f"{self.path}: {self.length / 1e6:.1f} MB", notes=self.missing)
 
 
 @command(stages=("reading", "drawing"), writes=())
@@ -62,7 +45,7 @@ def report(
     """
     from walop_jax import FitResult, Run
     from walop_jax.commands.diagnose import write
-    from walop_jax.reports.page import kind_of_run, render, render_other
+    from walop_jax.reports.page import Page, is_page, kind_of_run, render, render_other
     from walop_jax.reports.run import read_run
 
     wanted = goal_of(goal)
@@ -81,19 +64,10 @@ def report(
         if kind != "fit" and (wanted is not None or data):
             raise UsageError("this is for the page about a fit", "data" if wanted is None else "goal")
         contents = read_run(Run(folder, catalogue_of(effects), tuple(data or ()))) if kind == "fit" else None
-        overwrite = job.overwrite or _is_page(target)
+        overwrite = job.overwrite or is_page(target)
         check_output(target, overwrite=overwrite)
         job.tell("drawing", "drawing")
         page = render_other(folder, kind) if contents is None else render(contents, wanted)
     text, missing = encodable(page[0]), page[1]
     write_text(target, text, overwrite=overwrite)
     return Outcome(Page(target, len(text.encode()), missing), next=("open the page in a browser",))
-
-
-def _is_page(path: Path) -> bool:
-    """True if a file is a page that this program has written: then it is made anew without asking."""
-    try:
-        with path.open(encoding="utf-8") as stream:
-            return GENERATOR in stream.read(1000)
-    except (OSError, UnicodeDecodeError):
-        return False

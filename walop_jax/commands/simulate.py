@@ -8,10 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, given, typed, write_text
-from walop_jax.commands.inputs import InstrumentLike, design_of
-from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, left_out_sentences
+from walop_jax.commands.products import (
+    Effects,
+    InstrumentLike,
+    Product,
+    calibration_of,
+    catalogue_of,
+    design_of,
+    left_out_sentences,
+)
 from walop_jax.io.atomic import check_output
-from walop_jax.io.text import date_of, json_text, parse_toml, read_text, rounded
+from walop_jax.io.text import date_of, json_text, parse_toml, read_text
 
 if TYPE_CHECKING:
     from walop_jax import Effect, ObservingPlan
@@ -67,8 +74,8 @@ def simulate(
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.simulated_stars import simulated_stars
     from walop_jax.simulation.observing_plan import instrument_named, read_plan
+    from walop_jax.simulation.simulate import effect_in_words, effects_given, true_instrument
     from walop_jax.simulation.simulate import simulate as simulated
-    from walop_jax.simulation.simulate import true_instrument
     from walop_jax.simulation.truth import truth_document
 
     true = instrument if isinstance(instrument, Instrument) and plan is not None else None
@@ -85,7 +92,7 @@ def simulate(
             template = _template(like, catalogue)
             plan = template.planned(plan)
         plan = plan or ObservingPlan.usual(design_of(instrument) or nominal_instrument())
-        hidden, lost = _hidden(effect, plan, catalogue), ()
+        hidden, lost = effects_given(effect, plan, catalogue), ()
         if template is not None:
             true, lost = template.instrument_of(plan, hidden)
     except ValueError as error:
@@ -140,7 +147,7 @@ def simulate(
             write_calibration_set(output, calset, overwrite=job.overwrite)
     if truth is not None:
         write_text(truth, json_text(content), overwrite=job.overwrite)
-    text += f"; {'; '.join(map(_sized, true.effects)) or 'nothing'} beyond the base model"
+    text += f"; {'; '.join(map(effect_in_words, true.effects)) or 'nothing'} beyond the base model"
     if template is not None:
         mjd = float(np.nanmin(times))
         text += f"; the night of {date_of(mjd)}"
@@ -166,45 +173,3 @@ def _template(like: Any, catalogue: Sequence[EffectKind]) -> Template:
         return read_truth(like, catalogue)
     held = calibration_of(like, catalogue)
     return Template(held.model.instrument(held.values), held.sources)
-
-
-def _hidden(effect: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
-    """The effects that a set holds, also of a dict: {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}.
-
-    Raises ValueError for one that the instrument has no place for.
-    """
-    from walop_jax.model.light_path import NoSuchPlaceError
-    from walop_jax.simulation.simulate import effect_from_text
-
-    if isinstance(effect, Mapping):
-        pairs = {
-            name: ",".join(f"{k}:{v}" for k, v in size.items()) if isinstance(size, Mapping) else size
-            for name, size in effect.items()
-        }
-        effect = [f"{name}={size}" for name, size in pairs.items()]
-    context, hidden = plan.context(), []
-    for entry in [effect] if isinstance(effect, str) else effect or ():
-        hidden.append(effect_from_text(entry, context, catalogue) if isinstance(entry, str) else entry)
-        try:
-            hidden[-1].patch(plan.design)
-        except NoSuchPlaceError as error:
-            raise ValueError(f"effect {hidden[-1].name!r}: {error}") from None
-    return hidden
-
-
-_LISTED = 12  # numbers of a parameter that are listed
-
-
-def _sized(effect: Effect) -> str:
-    """An effect as `--effect` writes it, with its units: wollaston_axis=angle:0.3 deg."""
-    import numpy as np
-
-    numbers = []
-    for name, declared in effect.declarations().items():
-        values = np.ravel(getattr(effect, name))
-        text = "/".join(rounded(float(v)) for v in values)
-        if values.size > _LISTED:
-            text = f"{values.size} numbers of {rounded(float(np.sqrt(np.mean(values**2))))} rms"
-        if values.size:
-            numbers.append(f"{name}:{text} {declared.unit}".rstrip())
-    return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name

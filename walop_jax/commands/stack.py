@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, UsageError, command, several, typed
+from walop_jax.commands.command import Job, Outcome, UsageError, after_fit, command, several
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of
 from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 
@@ -50,9 +50,10 @@ def stack(
 
     >>> walop.stack(["night1.fits", "night2.fits"]).trusted  # doctest: +SKIP
     """
-    from walop_jax.nights.making import executor_of
-    from walop_jax.nights.stacking import PARTIAL, writers
+    from walop_jax.likelihood.workers import executor_of
+    from walop_jax.nights.stacking import PARTIAL
     from walop_jax.nights.stacking import stack as stacked
+    from walop_jax.nights.survey_folder import writers
 
     if workers is not None and scheduler is not None:
         raise UsageError("workers and scheduler exclude each other: a cluster has workers", "scheduler")
@@ -77,8 +78,5 @@ def stack(
         drop=(PARTIAL,),
         warnings=survey.verdict.warnings,
         trusted=survey.trusted,
-        next=(
-            typed("report", output),
-            *[typed("apply", output, "STARS.fits", "-o", "OUT.fits")] * survey.trusted,
-        ),
+        next=after_fit(output, usable=survey.trusted),
     )

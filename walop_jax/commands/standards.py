@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from walop_jax.commands.command import Job, Outcome, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike
-
-LOWEST = 30.0  # deg
+from walop_jax.commands.products import InstrumentLike
 
 
 @command(jax=False)
@@ -32,7 +30,7 @@ def standards(
 
     from walop_jax.data.records import Site
     from walop_jax.data.schema import EXPOSURES, check
-    from walop_jax.data.standards import shipped_standards
+    from walop_jax.data.standards import LOWEST, shipped_standards
     from walop_jax.data.units import Place
     from walop_jax.instruments.description import default_name, read_description
     from walop_jax.sky.directions import separation

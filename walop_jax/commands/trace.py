@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from walop_jax.commands import products
 from walop_jax.commands.command import Job, Outcome, UsageError, command
-from walop_jax.commands.inputs import InstrumentLike, design_of
-from walop_jax.commands.products import Angles, Effects, Product
+from walop_jax.commands.products import Angles, Effects, InstrumentLike, Product, design_of
 
 if TYPE_CHECKING:
     from walop_jax import Instrument

@@ -26,14 +26,9 @@ from walop_jax.data.records import (
     Site,
     Sources,
 )
+from walop_jax.data.repeats import mask_repeats, repeated_counts
 from walop_jax.data.settings import builtin_filter
-from walop_jax.data.table_intensities import (
-    TableIntensities,
-    mask_repeats,
-    repeated_counts,
-    table_intensities,
-    usable,
-)
+from walop_jax.data.table_intensities import TableIntensities, table_intensities, usable
 from walop_jax.data.units import Place, check_units, unit_of
 from walop_jax.data.write import EXTENSION, read_compression, remark, set_tables
 from walop_jax.io.errors import PathLike, fail, nearest

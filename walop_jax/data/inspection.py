@@ -5,17 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
+from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.checks import like_radians
 from walop_jax.data.kinds import CALIBRATION_PLATE
-from walop_jax.data.records import CalibrationSet, DataFlag, Exposures
-from walop_jax.data.table_intensities import TableIntensities, sampled
+from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, sampled
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import shipped
 from walop_jax.io.display import Display, Displayed
+from walop_jax.io.errors import DataError, PathLike
 from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
@@ -100,6 +102,11 @@ class Inspection(Displayed):
     filters: tuple[str, ...]
     findings: tuple[Finding, ...]
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """The findings that keep the set from a fit."""
+        return tuple(str(finding) for finding in self.findings if finding.severity == "fault")
+
     def display(self) -> Display:
         """Contents of the set, and findings."""
         low_x, high_x, low_y, high_y = self.field
@@ -132,6 +139,59 @@ class Inspection(Displayed):
             notes=tuple(f"{finding.severity} {finding}" for finding in self.findings)
             or ("nothing is wrong",),
         )
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class InspectedSets(Displayed):
+    """An inspection of every file, or the error that it gave; one of all as one set; faults in words."""
+
+    sets: tuple[tuple[str, Inspection | DataError], ...]
+    joint: Inspection | None
+    faults: tuple[str, ...]
+
+    @classmethod
+    def of(cls, calset: CalibrationSet) -> InspectedSets:
+        """The inspection of a set in memory."""
+        inspection = inspect(calset)
+        return cls(((", ".join(inspection.files) or "in memory", inspection),), None, inspection.faults)
+
+    @property
+    def inspections(self) -> tuple[Inspection, ...]:
+        """Those that could be made, that of all sets together the last."""
+        readable = [inspection for _, inspection in self.sets if not isinstance(inspection, DataError)]
+        return (*readable, *(() if self.joint is None else (self.joint,)))
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        sets = [
+            {"files": [path], "error": str(of)} if isinstance(of, DataError) else dataclasses.asdict(of)
+            for path, of in self.sets
+        ]
+        return {"sets": sets, "joint": None if self.joint is None else dataclasses.asdict(self.joint)}
+
+    def display(self) -> Display:
+        """The first of the inspections."""
+        return self.inspections[0].display() if self.inspections else Display("nothing that can be read")
+
+
+def inspect_files(
+    paths: Sequence[PathLike], tell: Callable[[str], None] = lambda text: None
+) -> InspectedSets:
+    """Every file by itself; all as one set if none has a fault. Raises `DataError` if they cannot be one."""
+    sets: list[tuple[str, Inspection | DataError]] = []
+    faults: list[str] = []
+    for path in paths:
+        tell(f"reading {path}")
+        try:
+            inspection = inspect(read_calibration_set(path))
+        except DataError as error:
+            faults.append(str(error))
+            sets.append((str(path), error))
+            continue
+        faults += [f"{path}: {fault}" for fault in inspection.faults]
+        sets.append((str(path), inspection))
+    joint = inspect(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
+    return InspectedSets(tuple(sets), joint, tuple(faults))
 
 
 def inspect(calset: CalibrationSet) -> Inspection:

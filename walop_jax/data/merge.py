@@ -22,7 +22,8 @@ from walop_jax.data.records import (
     Position,
     Sources,
 )
-from walop_jax.data.table_intensities import TableIntensities, empty_block, mask_repeats, repeated_counts
+from walop_jax.data.repeats import mask_repeats, repeated_counts
+from walop_jax.data.table_intensities import TableIntensities, empty_block
 from walop_jax.io.errors import DataError, fail
 
 

@@ -17,6 +17,8 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
+RUN = 64  # field points that are sampled together
+
 
 class DataFlag(enum.IntFlag):
     """Bits of FLAG of an intensity: any of them keeps it from being used."""
@@ -422,3 +424,12 @@ class Intensities:
     def rows(self) -> int:
         """Number of used rows, that is of (exposure, point) pairs with a good intensity in every camera."""
         raise NotImplementedError
+
+
+def sampled(intensities: Intensities, total: int, most: int) -> tuple[Int[np.ndarray, " p"], Block]:
+    """Field points of a set of so many, `most` at most and in evenly spaced runs, and their data."""
+    if total <= most:
+        return np.arange(total), intensities.block(0, total)
+    starts = np.linspace(0, total - RUN, most // RUN).astype(int)
+    blocks = [intensities.block(start, start + RUN) for start in starts.tolist()]
+    return (starts[:, None] + np.arange(RUN)).ravel(), Block.joined(blocks)

@@ -13,15 +13,18 @@ import itertools
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from walop_jax.data.header_words import columns_of, json_content, overlapping
+from walop_jax.data.header_words import Words, columns_of, exposures_table, json_content, overlapping
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Exposures, Position, Site
+from walop_jax.data.schema import EXPOSURES
 from walop_jax.data.units import degrees_of, mjd_of, sexagesimal
 from walop_jax.io.errors import PathLike, fail
+from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some
 from walop_jax.io.toml import Reader
 
@@ -37,6 +40,22 @@ MOST_EXPOSURES = 10_000
 SLACK = 30.0  # minutes that a window is longer than its exposures, on both sides
 ALIKE = 180.0  # deg after which a wave plate is the same again
 ELEMENTS = {CALIBRATION_PLATE: "hwp", POLARISER: "polarizer"}
+
+
+def read_exposures(paths: Sequence[PathLike], rules: Words) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns of EXPOSURES in records of an observatory: headers, a log, tables, or a schedule; and remarks."""
+    single = len(paths) == 1 and Path(paths[0]).suffix.lower() == ".json"
+    content = json_content(paths[0]) if single else None
+    if is_schedule(content):
+        return read_schedule(paths[0], rules.filters, content)
+    return exposures_table(paths, rules, content)
+
+
+def exposures_as_table(columns: Mapping[str, np.ndarray]) -> Any:
+    """The columns of EXPOSURES as an astropy table with their units."""
+    units = {name: "deg" for name in columns if name.endswith(("_ANGLE", "_TURN"))}
+    units |= {name: rule.unit for name, rule in EXPOSURES.items()}
+    return astropy_table({name: (values, units.get(name, ""), "") for name, values in columns.items()})
 
 
 def is_schedule(content: Any) -> bool:

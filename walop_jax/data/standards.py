@@ -19,6 +19,7 @@ USUAL_SCATTER = 0.27
 POLARISED = 3.0  # errors
 UNPOLARISED = 0.005
 """Largest p of a standard of zero polarisation."""
+LOWEST = 30.0  # deg above the horizon, of a standard that is up
 
 
 def shipped_standards() -> Any:

@@ -37,6 +37,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import linalg, special
 
+from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
@@ -55,9 +56,11 @@ from walop_jax.diagnosis.variance_components import (
 )
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
-from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixels
+from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_structure, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
+from walop_jax.io.errors import fail
 from walop_jax.io.text import some
+from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelExpansion
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
@@ -221,6 +224,18 @@ def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
 def pixel_structure(result: FitResult) -> Structure:
     """By how much single pixels of whole frames differ beyond the model of a fit."""
     return structure_of(found_components(_of_pixels(result)))
+
+
+def stand_in(result: FitResult) -> CalibrationSet:
+    """The set of some hundred field points that stands for whole frames. Raises `DataError` for other data."""
+    if not isinstance(result.expansion, PixelExpansion):
+        where = result.calset.inputs[0].path if result.calset.inputs else "in memory"
+        advice = (
+            "only whole frames of many pixels can, under a model that is smooth over the field, with detectors that "
+            "report counts as they are; tables and small frames are small enough as they are"
+        )
+        raise fail("cannot be compressed", file=where, advice=advice)
+    return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
 def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:

@@ -7,6 +7,8 @@ and where every arm has a flux of its own, the whole series of the first one is:
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.data.merge import parts_of
@@ -14,6 +16,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.model_file import GAUGE, Catalogue, ModelTable, header_of, known_to, parse, with_effects_of
 from walop_jax.instruments.description import shipped
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import EFFECTS, Deviations
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
@@ -150,3 +153,25 @@ def model_like(calset: CalibrationSet, old: Model) -> Model:
             p = dataclasses.replace(p, start=start, free=like.free, prior=like.prior, tie=like.tie)
         parameters.append(p)
     return dataclasses.replace(model, parameters=tuple(parameters), laws=old.laws)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModelFile(Displayed):
+    """A model, its TOML text, and the file that it was written to (None: to no file)."""
+
+    model: Model
+    text: str
+    path: Path | None
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        keys, model = ("start", "unit", "prior", "free", "tie", "about"), self.model
+        document = {"instrument": model.name, "effects": list(model.effect_names)}
+        document |= {"output": None if self.path is None else str(self.path)}
+        return document | {"parameters": {p.name: {k: getattr(p, k) for k in keys} for p in model.parameters}}
+
+    def display(self) -> Display:
+        """Its file and its size."""
+        where = self.model.name if self.path is None else self.path
+        parameters, free = len(self.model.parameters), len(self.model.free)
+        return Display(f"{where}: {parameters} parameters, {free} of them free")

@@ -22,7 +22,7 @@ from walop_jax.io.fits_reading import OpenFile, open_fits
 from walop_jax.io.names import NIGHTS
 from walop_jax.io.text import in_ascii
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.equations import EffectAmplitude, Night
+from walop_jax.nights.together import EffectAmplitude, Night
 
 NIGHTVER = 1
 _NAN = float("nan")

@@ -5,43 +5,49 @@ The files of a survey: docs, files. Nights that are made lie in its folder `part
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import itertools
-import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.schema import EXPOSURES, Column
-from walop_jax.data.units import Place
-from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table
+from walop_jax.data.schema import Column
+from walop_jax.data.user_tables import in_memory, numeric_column, read_input_table
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import STATED, Doubt, Quality
-from walop_jax.io.errors import DataError, fail
+from walop_jax.fit.verdict import Doubt, Quality
+from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import primary_keywords
-from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
+from walop_jax.io.names import NIGHTS, PRODUCT
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import check_input, parse_toml, read_text
 from walop_jax.model.effects import EFFECTS, EffectKind
-from walop_jax.model.laws import Law, laws_of, resolved
+from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Laws, OfUnits, Solution, UndeterminedError
-from walop_jax.nights.breaks import Break, at_solution, solved, with_breaks
-from walop_jax.nights.breaks import find as breaks_of
-from walop_jax.nights.equations import Night, Together, data_hash, source_of, together
+from walop_jax.nights.break_search import find as breaks_of
+from walop_jax.nights.breaks import solved
+from walop_jax.nights.equations import data_hash
 from walop_jax.nights.making import Data, Maker, Task, made
-from walop_jax.nights.night_file import nights_in, read_nights, write_nights
+from walop_jax.nights.night_file import read_nights
 from walop_jax.nights.survey import Survey
+from walop_jax.nights.survey_folder import (
+    Kept,
+    breaks_in,
+    doubts_about,
+    kept_in,
+    laws_of_all,
+    survey_of,
+    undetermined,
+)
+from walop_jax.nights.together import Night, Together, together
 from walop_jax.posterior.run import Run
 
 AtHand = Mapping[tuple[str, int], Data]
@@ -50,21 +56,10 @@ Make = Callable[[Sequence[Task]], Iterator[list[Night]]]
 Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
 
-LONG = 60.0  # days without a night that are worth a remark
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
 EXACT = 1e-3  # standard errors by which linearising all nights again may move the solution at most
 ROUNDS = 6
 PARTIAL = "partial"  # folder of the nights that are made, until all are
-
-
-class _Opened(NamedTuple):
-    """Nights as given, or data that they can be made of, with their fit, breaks and events."""
-
-    nights: list[Night]
-    data: Data | None = None
-    fit: Calibration | None = None
-    breaks: tuple[Break, ...] = ()
-    events: tuple[tuple[float, str], ...] = ()
 
 
 def stack(
@@ -92,32 +87,30 @@ def stack(
     Raises `DataError` for nights that do not belong together, that do not determine a parameter under its law, and for
     nights without a filter in common; ValueError for laws that are wrong, or of parameters that do not exist.
     """
-    opened = [_opened(entry, catalogue) for entry in nights]
+    kept, given = zip(*(_opened(entry, catalogue) for entry in nights), strict=True) if nights else ((), ())
     like = Calibration.from_fit(like) if isinstance(like, FitResult) else like
-    fits = [entry for entry in (like, *(source.fit for source in opened)) if entry is not None]
-    maker = Maker(fits[0] if fits else None, partial, len(opened))
+    fits = [entry for entry in (like, *(source.fit for source in kept)) if entry is not None]
+    maker = Maker(fits[0] if fits else None, partial, len(kept))
     make = functools.partial(made, maker, executor)
     all_nights: list[Night] = []
     at_hand: dict[tuple[str, int], Data] = {}
-    new = make([Task(entry.data) for entry in opened if entry.data is not None])
-    for k, entry in enumerate(opened):
-        source = entry.nights
-        if entry.data is not None:
-            tell(f"{k + 1} of {len(opened)}")
+    new = make([Task(entry) for entry in given if entry is not None])
+    for k, entry in enumerate(given):
+        source = kept[k].nights
+        if entry is not None:
+            tell(f"{k + 1} of {len(given)}")
             source = next(new)
-            at_hand |= {night.key: entry.data for night in source}
+            at_hand |= {night.key: entry for night in source}
         all_nights += source
     data = together(all_nights)
-    doubts = [*_about_fits(fits), *_about_time(data.nights)]
+    doubts = doubts_about(fits, data)
     tables: Mapping[str, Any] = laws if isinstance(laws, Mapping) else {}
     if isinstance(laws, str | os.PathLike):
         tables = parse_toml(read_text(laws)).get("law", {})
     elif laws is None and maker.like is not None:
         tables = maker.like.model.laws
     chosen = laws_of_all(data, tables)
-    _check_filters(data, chosen)
-    every = (entry for source in opened for entry in source.breaks)
-    breaks = [entry for entry in every if with_breaks(data, chosen, [entry]) == chosen]  # still laws
+    breaks = breaks_in(data, chosen, kept)
     try:
         if find and len({night.number for night in data.nights}) > 2:
             # Ahead of linearising again: with breaks that are no law yet the common solution is one of no night.
@@ -138,19 +131,13 @@ def stack(
             data, *_ = _linearised(data, solution, chosen, order, at_hand, make, names)
             data, solution, settled = _settled(data, chosen, at_hand, make)
     except UndeterminedError as error:
-        raise _undetermined(data, error) from None
+        raise undetermined(data, error) from None
     if not settled:
         what = "the solution has not settled: the nights differ by more than their laws and the breaks that were found"
         doubts.append(Doubt(Quality.NOT_CONVERGED, what))
-    if fixed := sum(night.key not in at_hand for night in data.nights):
-        what = (
-            f"{fixed} of {len(data.nights)} nights stay as they were linearised: their data are not at hand"
-        )
-        doubts.append(Doubt(Quality(0), what, blocking=False))
-    happened = {event for source in opened for event in source.events}
-    happened |= set(() if events is None else events_of(events))
-    breaks = sorted((at_solution(data, solution, entry) for entry in breaks), key=lambda entry: entry.night)
-    return Survey(data, chosen, solution, maker.like, tuple(doubts), tuple(breaks), tuple(sorted(happened)))
+    happened = [event for source in kept for event in source.events]
+    happened += [] if events is None else events_of(events)
+    return survey_of(data, chosen, solution, maker.like, doubts, breaks, happened, at_hand)
 
 
 def events_of(table: Any) -> list[tuple[float, str]]:
@@ -164,82 +151,26 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
 
-def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> tuple[Law | None, ...]:
-    """A law for every parameter and candidate of nights (None: absent). ValueError for wrong `laws`."""
-    tables = {name: law.document() if isinstance(law, Law) else law for name, law in laws.items()}
-    cut = len(data.names) - data.candidates
-    alone = [name for name, gauge in zip(data.names, data.gauge, strict=True) if gauge]
-    return resolved(laws_of(tables), data.names[:cut], data.names[cut:], alone)
-
-
-def writers(survey: Survey) -> dict[str, Callable[[Path], object]]:
-    """Writers of the files of a survey, but for its document."""
-    return {
-        NIGHTS: lambda path: write_nights(path, survey.data.aligned()),
-        REFERENCE: lambda path: write_calibration(path, dataclasses.replace(survey.reference, path=None)),
-        PRODUCT: lambda path: write_calibration(path, survey.at(survey.last)),
-        TRACKS: lambda path: survey.tracks.write(path, format="fits"),
-    }
-
-
-def read_survey(folder: str | os.PathLike[str], catalogue: Sequence[EffectKind] = EFFECTS) -> Survey:
-    """The survey of a folder, solved again. Raises `DataError` for a folder that is none."""
-    return stack([folder], find=False, catalogue=catalogue)
-
-
-def is_survey(given: Any) -> TypeGuard[str | os.PathLike[str]]:
-    """True for the path of a survey."""
-    return isinstance(given, str | os.PathLike) and (Path(given) / SURVEY).exists()
-
-
-def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = False) -> Calibration:
-    """The calibration for stars of one day (MJD, UTC).
-
-    Raises `DataError` for stars without a time, of more than a day, on both sides of a change, of two nights with
-    values of their own, and, unless `force` is given, outside the validity.
-    """
-    place, mjd = Place(stars.path, ""), numeric_column(stars, "MJD", EXPOSURES["MJD"])
-    advice = "add the times (UTC) of the exposures, or give one calibration.fits for all"
-    place.refuse(~np.isfinite(mjd), "is not given, and a survey changes with time", "MJD", advice)
-    low, high = float(mjd.min()), float(mjd.max())
-    advice = "give a catalogue for every night"
-    if high - low > 1.0:
-        raise place.fail(f"spans {high - low:.1f} days", "MJD", advice)
-    if changed := [edge for edge in survey.edges if low < edge <= high]:
-        raise place.fail(f"the instrument changed between the stars, at {changed[0]:.3f}", "MJD", advice)
-    of_single_nights = any(law.base in ("night", "file") for law in survey.changing.values())
-    if of_single_nights and survey.night_at(low) != survey.night_at(high):
-        raise place.fail("spans two nights, each of which has values of its own", "MJD", advice)
-    for moment in (low, high):
-        survey.at(moment, force=force)
-    return survey.at(0.5 * (low + high), force=force)
-
-
-def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
-    """Nights, or data that they can be made of, with the fit, breaks and events that come with them."""
+def _opened(one: Given, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data | None]:
+    """Nights that are kept, or a fit and data that they can be made of."""
     if isinstance(one, Night):
-        return _Opened([one])
+        return Kept([one]), None
     if isinstance(one, FitResult):
         product = Calibration.from_fit(one)
-        return _Opened([], Data(one.calset, data_hash(one.calset), product.model), product)
+        return Kept(fit=product), Data(one.calset, data_hash(one.calset), product.model)
     if isinstance(one, CalibrationSet):
-        return _Opened([], Data(one, data_hash(one)))
+        return Kept(), Data(one, data_hash(one))
     path = one.folder if isinstance(one, RunFolder) else Path(one)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
-        fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
-        folder = RunFolder(path)
-        document = folder.document(SURVEY) if SURVEY in folder else {"breaks": [], "events": []}
-        breaks = tuple(Break.read(entry) for entry in document["breaks"])
-        events = tuple((float(entry["mjd"]), str(entry["what"])) for entry in document["events"])
-        return _Opened(nights_in(path), None, fit, breaks, events)
+        return kept_in(path, catalogue), None
     keywords = () if path.is_dir() else primary_keywords(path)
     if "NIGHTVER" in keywords:
-        return _Opened(read_nights(path))
+        return Kept(read_nights(path)), None
     if path.is_dir() or "PRODVERS" in keywords:
         run = one if isinstance(one, Run) else Run(path if path.is_dir() else path.parent, catalogue)
-        return _Opened([], Data(run, data_hash(run.calset)), run.calibration)
+        return Kept(fit=run.calibration), Data(run, data_hash(run.calset))
     with check_input(path).open("rb") as raw:
-        return _Opened([], Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest()))
+        return Kept(), Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest())
 
 
 def _settled(data: Together, laws: Laws, at_hand: AtHand, make: Make) -> tuple[Together, Solution, bool]:
@@ -327,48 +258,3 @@ def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Para
     template = like.model.template
     changes = kind.neutral(effect_context(template, like.exposures)).first_order(template)
     return all(change.of_stars for orders in changes for _, change in orders)
-
-
-def _about_fits(fits: Sequence[Calibration]) -> list[Doubt]:
-    doubts = []
-    for fit in fits:
-        where = str(fit.path or source_of(fit))
-        if fit.verdict.errors_from != STATED:
-            what = f"the errors of {where} do not explain its scatter, and nights are weighed by them"
-            raise fail(what, advice="correct N_ERR, or leave the night out")
-        if not fit.verdict.trusted:
-            doubts.append(Doubt(fit.verdict.quality, f"the fit of {where} is not trusted"))
-    return doubts
-
-
-def _undetermined(data: Together, error: UndeterminedError) -> DataError:
-    name = data.names[error.parameter]
-    if error.unit is None:
-        what = f"the nights do not determine {name} under its law"
-        return fail(what, advice="give it a prior, or another law")
-    what = f"has no information on {name}, which has a value of its own there"
-    night = f"the night of MJD {data.nights[error.unit].number}"
-    return fail(f"{night} {what}", advice="give its law a spread, or let it be shared")
-
-
-def _about_time(nights: Sequence[Night]) -> list[Doubt]:
-    doubts, reached = [], math.inf
-    for begin, end in sorted((night.begin, night.end) for night in nights):
-        if begin - reached > LONG:
-            what = f"no night from MJD {reached:.1f} to {begin:.1f}: what holds there rests on the laws alone"
-            doubts.append(Doubt(Quality(0), what, blocking=False))
-        reached = end if math.isinf(reached) else max(reached, end)
-    return doubts
-
-
-def _check_filters(data: Together, laws: Laws) -> None:
-    first = data.nights[0]
-    pairs = zip(laws, data.parameters, strict=True)
-    free = {law.base for law, p in pairs if law and p.name.startswith("throughput.")}
-    for night in data.nights[1:]:
-        if not set(night.filters) & set(first.filters) and not free & {"night", "file"}:
-            raise fail(
-                f"nights in other filters with the same throughputs: {', '.join(first.filters)} (MJD {first.number}) "
-                f"and {', '.join(night.filters)} (MJD {night.number})",
-                advice='stack them apart, or give [law."throughput.*"] per = "night"',
-            )

@@ -20,7 +20,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import GOAL, measures_u, p_errors
+from walop_jax.calibration.accuracy import (
+    GOAL,
+    NODES,
+    SIZE,
+    TOLERANCE,
+    judged,
+    measures_u,
+    p_errors,
+    reached,
+)
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
@@ -33,8 +42,7 @@ from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Matrix, Solution, Vector
 from walop_jax.nights.breaks import Break, among_globals
 from walop_jax.nights.changes import scan
-from walop_jax.nights.equations import EffectAmplitude, Together
-from walop_jax.science.field_accuracy import NODES, SIZE, TOLERANCE, judged, reached
+from walop_jax.nights.together import EffectAmplitude, Together
 from walop_jax.sky.nights import night_of
 
 OfMatrix = tuple[Float[np.ndarray, "p 6"], Float[np.ndarray, "p 6 k"], Float[np.ndarray, "p 6 6"], float]

@@ -40,7 +40,8 @@ from walop_jax.io.errors import DataError
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.science.estimate import estimate
 from walop_jax.science.star_errors import QuPairs, transmitted
-from walop_jax.sky.moon import moon_sky, sky_to_instrument
+from walop_jax.sky.moon import moon_sky
+from walop_jax.sky.position_angles import sky_to_instrument
 
 TERMS = ("1", "qm", "um", "qm^2", "um^2")
 _ROUNDS = 300  # of alternating least squares for transmissions and fluxes; 40 are enough

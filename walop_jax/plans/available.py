@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.data.records import Exposures
-from walop_jax.io.errors import errors_naming
+from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.model.parameters import check_names
 from walop_jax.simulation.observing_plan import EXPOSED, OUT, ObservingPlan, Stop, is_plan, plan_of
@@ -27,6 +28,7 @@ from walop_jax.sky.directions import separation
 from walop_jax.sky.moon import altitude, body_direction
 
 DARK = -12.0  # altitude of the Sun (deg) below which the sky is dark enough for Moon and stars
+MOST_ANGLES = 24  # of a moving element, where a plan takes them from a calibration
 _FULL = 120.0  # distance of Moon and Sun (deg) from which the Moon is as good as full
 _SEARCHED, _STEP = 60.0, 1.0 / 24.0  # days in which a better time is looked for, and its steps
 
@@ -270,3 +272,24 @@ class Available:
         high = altitude(mjd, *moon, site) >= self.altitude + self.plan.separations[1]
         good = np.flatnonzero(high & (altitude(mjd, *sun, site) < DARK) & (separation(*moon, *sun) > _FULL))
         return f"; mjd = {mjd[good[0]]:.2f} would do" if len(good) else "; choose another night (mjd)"
+
+
+def plan_beside(prior: Calibration) -> ObservingPlan:
+    """A plan of the instrument of a calibration, whose moving elements stand where they stood in its exposures.
+
+    Raises `DataError` for one that stood at too many angles; the calibration plate is left to the plan.
+    """
+    others = (prefix for prefix in prior.design.moving() if prefix != CALIBRATION_PLATE)
+    moving = {prefix: _stood_at(prior.exposures, prefix) for prefix in others}
+    design = prior.design if prior.design.description else prior.instrument
+    return ObservingPlan(design, moving=moving)
+
+
+def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
+    """Angles (deg, None: out) at which a moving element stood in the exposures of a calibration."""
+    position = exposures.position(prefix)
+    stood = np.unique(np.where(position.inside, np.mod(position.angle, 360.0).round(3), np.nan))
+    if len(stood) > MOST_ANGLES:
+        advice = f"say moving = {{ {prefix} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml"
+        raise fail(f"{prefix} stood at {len(stood)} angles, more than could be tried", advice=advice)
+    return tuple(float(angle) if np.isfinite(angle) else None for angle in stood)

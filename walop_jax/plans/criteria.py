@@ -15,17 +15,25 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.accuracy import measures_u, p_forms, sample_stars
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
 from walop_jax.data.schema import Column
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import InputTable, numeric_column
 from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.findings import Diagnosis, document
+from walop_jax.io.errors import fail
+from walop_jax.io.names import DIAGNOSIS
+from walop_jax.io.run_folder import RunFolder
 from walop_jax.likelihood.inverses import root_of, square_root
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.parameters import check_names
@@ -216,3 +224,23 @@ def _apart(found: Candidates) -> Criterion:
     targets[:, 0, len(base)] = 1.0
     what = f"least distance of {', '.join(effects)}"
     return Criterion(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))
+
+
+def effects_alike(after: Any, prior: Calibration) -> tuple[Any, ...]:
+    """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name.
+
+    `after` is the diagnosis, or its folder, `prior` its calibration. Raises `DataError` where there are none.
+    """
+    diagnosis, path = document(after) if isinstance(after, Diagnosis) else None, None
+    if isinstance(after, RunFolder | str | os.PathLike):
+        folder = after if isinstance(after, RunFolder) else RunFolder(Path(after))
+        diagnosis, path = folder.documents.get("diagnosis"), folder.folder / DIAGNOSIS
+    if diagnosis is None:
+        advice = "run diagnose first, or name the effects with --apart (apart= in Python)"
+        raise fail("no diagnosis", file=path, advice=advice)
+    effects_of_model = {effect.name: effect for effect in prior.model.instrument(prior.values).effects}
+    for step in diagnosis["steps"]:
+        if step["equivalent"] and step["effect"] in effects_of_model:
+            return (effects_of_model[step["effect"]], *step["equivalent"])
+    advice = "name the effects to be separated with --apart"
+    raise fail("the diagnosis left no effects that look alike", file=path, advice=advice)

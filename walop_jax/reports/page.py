@@ -21,7 +21,7 @@ from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.product import read_product
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
-from walop_jax.io.display import Display, signed
+from walop_jax.io.display import Display, Displayed, signed
 from walop_jax.io.errors import fail
 from walop_jax.io.names import COMMISSIONING, DOCUMENTS, LIMITS, SUMMARY, TRACKS
 from walop_jax.io.run_folder import RunFolder
@@ -37,6 +37,7 @@ from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_w
 from walop_jax.science.commissioning import Certificate, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 
+GENERATOR = '<meta name="generator" content="walop-jax'  # of every page
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 MANY = 32  # rows of a table above which it is folded
@@ -45,6 +46,23 @@ SMALL = ("ladder", "protection")  # figures that take half of the width
 
 NARROW = Canvas(width=WIDTHS["column"] / 25.4)
 """The canvas of the same figure on the screen of a telephone: panels go below each other."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Page(Displayed):
+    """A page that was written: where, its length in bytes, and in words the files that the run lacked for it."""
+
+    path: Path
+    length: int
+    missing: tuple[str, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
+
+    def display(self) -> Display:
+        """Its file and size, and the files that the run lacked for it."""
+        return Display(f"{self.path}: {self.length / 1e6:.1f} MB", notes=self.missing)
 
 
 class Picture(NamedTuple):
@@ -464,3 +482,12 @@ def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: li
             old, new = (read_product(Path(path)).maps for path in (old_file, folder))
             pictures.append(picture("change", functools.partial(figures.matrix_change_figure, old, new)))
     return pictures
+
+
+def is_page(path: Path) -> bool:
+    """True if a file is a page that this program has written: then it is made anew without asking."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            return GENERATOR in stream.read(1000)
+    except (OSError, UnicodeDecodeError):
+        return False

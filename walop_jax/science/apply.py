@@ -31,7 +31,7 @@ from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.left_over_sky import with_sky
 from walop_jax.science.star_residuals import StarResiduals, by_place
-from walop_jax.sky.moon import sky_to_instrument
+from walop_jax.sky.position_angles import sky_to_instrument
 
 OfRows = Float[np.ndarray, "r k"]  # by row and camera
 Rows = Int[np.ndarray, " r"]

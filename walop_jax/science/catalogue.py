@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.data import user_tables
+from walop_jax.data.repeats import equal_rows
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
-from walop_jax.data.table_intensities import equal_rows
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text

@@ -24,11 +24,11 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data.schema import Column
-from walop_jax.data.user_tables import InputTable, numeric_column, read_input_table, sky_positions
+from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table, sky_positions
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
 from walop_jax.sky.directions import designations, galactic
-from walop_jax.sky.moon import sky_to_instrument
+from walop_jax.sky.position_angles import sky_to_instrument
 
 Vector = Float[np.ndarray, " n"]
 Pairs = Float[np.ndarray, "n 2"]
@@ -156,6 +156,12 @@ def _about_north(ra: Vector, dec: Vector, rotator: Vector) -> list[str]:
         return []
     what = f"their angles refer to north at the field centre, up to {off:.2g} deg from their own"
     return [f"ROTATOR is the same for all stars: {what}; give that at each star (walop-jax gather does)"]
+
+
+def in_common_form(made: Any) -> tuple[Any, tuple[str, ...]]:
+    """The common table of an astropy table that `apply` made, and remarks: its faults, if any, among them."""
+    table, remarks = common_table(in_memory(made, "the result"))
+    return table, (*remarks, *check_common_table(table))
 
 
 def check_common_table(table: Any) -> tuple[str, ...]:

@@ -14,13 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.errors import fail, nearest
+from walop_jax.io.errors import PathLike, fail, nearest
+from walop_jax.io.folder import output_folder
 from walop_jax.io.text import read_text, some
 
 SHOWN = 4  # numbers that one mistake explains
 ANGLES = ("EVPA", "EVPA_SKY")  # degrees, the same after half a turn
 PACK = files("walop_jax") / "science" / "conformance_pack"
 
+SHIPPED = ("cases.csv", "given.csv", "answers.csv", "README.txt")
+RESULTS = "results.csv"
 Key = tuple[str, str]  # a case and a quantity
 
 
@@ -78,6 +81,17 @@ def rows(name: str) -> list[dict[str, str]]:
 def values(name: str) -> dict[Key, float]:
     """The numbers of such a table by case and quantity."""
     return {(row["CASE"], row["QUANTITY"]): float(row["VALUE"]) for row in rows(name)}
+
+
+def write_pack(place: PathLike, *, overwrite: bool = False) -> int:
+    """Write the questions into a folder, with a table for the answers; gives their number."""
+    expected = values("answers.csv")
+    with output_folder(place, (*SHIPPED, RESULTS), overwrite=overwrite) as out, out.filled() as folder:
+        for name in SHIPPED:
+            (folder / name).write_text((PACK / name).read_text("utf-8"), encoding="utf-8")
+        blank = "".join(f"{case},{quantity},\n" for case, quantity in expected)
+        (folder / RESULTS).write_text(f"CASE,QUANTITY,VALUE\n{blank}", encoding="utf-8")
+    return len({case for case, _ in expected})
 
 
 def judge(answers: dict[Key, float | None]) -> Conformance:

@@ -48,7 +48,7 @@ from walop_jax.model.conventions import matrix_elements
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
-from walop_jax.sky.moon import sky_to_instrument
+from walop_jax.sky.position_angles import sky_to_instrument
 
 Vector = Float[np.ndarray, " k"]
 Matrix = Float[np.ndarray, "k k"]

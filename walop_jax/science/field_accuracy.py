@@ -14,19 +14,27 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.calibration.accuracy import GOAL, measures_u, p_errors, p_forms, sample_stars
+from walop_jax.calibration.accuracy import (
+    GOAL,
+    NODES,
+    SHARE,
+    SIZE,
+    TOLERANCE,
+    judged,
+    measures_u,
+    p_errors,
+    p_forms,
+    reached,
+    sample_stars,
+)
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood.inverses import whitening
 
-SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
-SIZE = 21  # points along each axis of the map
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
-NODES = (10, 14, 20, 28)
-TOLERANCE = 1e-2  # relative, of errors that are given with two digits
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -182,17 +190,6 @@ def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: b
     found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
     # An error that is NaN is not known.
     return Requirement(f"p known to {limit} in {where}", error <= allowed, found, advice, needed)
-
-
-def reached(error: Float[np.ndarray, "*p"]) -> float:
-    """The error that `SHARE` of some places stay below; NaN without a place."""
-    return float(np.quantile(error, SHARE)) if error.size else np.nan
-
-
-def judged(without_u: float) -> str:
-    """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
-    field = f"{100 * SHARE:.0f} % of the field"
-    return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 
 
 def answered(result: FitResult, goal: float = GOAL) -> FitResult:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.data import user_tables
-from walop_jax.data.camera_catalogues import CameraCatalogue
+from walop_jax.data.camera_catalogues import CameraCatalogue, angle_of, centre_of
 from walop_jax.data.schema import Column
 from walop_jax.data.user_tables import OF_STARS
 from walop_jax.io.errors import fail
@@ -53,6 +53,32 @@ class Gathered:
     registrations: tuple[Registration, ...]
     matched: Int[np.ndarray, " n"]
     remarks: tuple[str, ...]
+
+
+def pointing_of(catalogues: Catalogues, given: dict[str, float | None]) -> tuple[Pointing, list[str]]:
+    """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last.
+
+    Raises `DataError` where it is nowhere, and for angles (deg) that cannot be meant.
+    """
+    first, remarks = catalogues[0], []
+    numbers = {name: angle_of(first, name) if value is None else value for name, value in given.items()}
+    missing = [name for name, value in numbers.items() if value is None]
+    if missing:
+        from_wcs = centre_of(first.header)
+        if from_wcs is None:
+            what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
+            advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
+            raise fail(what, file=first.path, advice=advice)
+        numbers |= {name: from_wcs[name] for name in missing}
+        stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
+        remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
+    values = {name: float(value) for name, value in numbers.items() if value is not None}
+    for name, value in values.items():
+        limit = 90.0 if name == "DEC" else 360.0
+        if not abs(value) <= limit:
+            what = f"{name} of the field centre is {value:g} deg"
+            raise fail(what, file=first.path, advice=f"at most {limit:g} deg")
+    return Pointing(*values.values()), remarks
 
 
 def gather(

@@ -21,7 +21,7 @@ from walop_jax.science.gathering import Columns
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import PhotonNoise
 from walop_jax.sky.directions import Pointing
-from walop_jax.sky.moon import sky_to_instrument
+from walop_jax.sky.position_angles import sky_to_instrument
 
 POINTING = Pointing(ra=97.5, dec=-44.0, rotator=35.0)
 ELECTRONS = (2e4, 2e6)  # of a camera, log-uniform

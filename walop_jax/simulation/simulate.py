@@ -7,7 +7,7 @@ physics; the physics itself is held against outside data and the oracle of the t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from walop_jax.data.records import Block, CalibrationSet, Sources
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.io.text import rounded
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
@@ -27,6 +28,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_orde
 from walop_jax.model.effects.base import Context, Effect
 from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.instrument import Instrument, adapted
+from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import Component, leaves, unknown_name, values_of, with_values
 from walop_jax.model.plan import with_median
 from walop_jax.model.sources import Standards
@@ -44,6 +46,7 @@ _MEDIAN_ROUNDS = 6  # the median that a pedestal refers to has the pedestal in i
 _POLARISED = (0.01, 0.06)
 _PROBE = 0.01  # of q and u
 _STAR_TEFF = (5000.0, 9500.0)
+_LISTED = 12  # numbers of a parameter that are listed
 
 
 class Simulated(NamedTuple):
@@ -339,6 +342,27 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     return counts
 
 
+def effects_given(effect: Any, plan: ObservingPlan, catalogue: Sequence[EffectKind]) -> list[Effect]:
+    """The effects that a set is to hold: texts, objects, or a dict, {"clp_wobble": {"amplitude": 0.06, "phase": 1.0}}.
+
+    Raises ValueError for one that the instrument has no place for.
+    """
+    if isinstance(effect, Mapping):
+        pairs = {
+            name: ",".join(f"{k}:{v}" for k, v in size.items()) if isinstance(size, Mapping) else size
+            for name, size in effect.items()
+        }
+        effect = [f"{name}={size}" for name, size in pairs.items()]
+    context, hidden = plan.context(), []
+    for entry in [effect] if isinstance(effect, str) else effect or ():
+        hidden.append(effect_from_text(entry, context, catalogue) if isinstance(entry, str) else entry)
+        try:
+            hidden[-1].patch(plan.design)
+        except NoSuchPlaceError as error:
+            raise ValueError(f"effect {hidden[-1].name!r}: {error}") from None
+    return hidden
+
+
 def effect_from_text(text: str, context: Context, catalogue: Sequence[EffectKind] = EFFECTS) -> Effect:
     """The effect of `catalogue` that a text stands for.
 
@@ -389,3 +413,16 @@ def _value(text: str, name: str) -> Any:
         if text.isidentifier():
             return text
         raise ValueError(f"effect {name!r}: {text!r} is not a number") from None
+
+
+def effect_in_words(effect: Effect) -> str:
+    """An effect as `--effect` writes it, with its units: wollaston_axis=angle:0.3 deg."""
+    numbers = []
+    for name, declared in effect.declarations().items():
+        values = np.ravel(getattr(effect, name))
+        text = "/".join(rounded(float(v)) for v in values)
+        if values.size > _LISTED:
+            text = f"{values.size} numbers of {rounded(float(np.sqrt(np.mean(values**2))))} rms"
+        if values.size:
+            numbers.append(f"{name}:{text} {declared.unit}".rstrip())
+    return f"{effect.name}={', '.join(numbers)}" if numbers else effect.name

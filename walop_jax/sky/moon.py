@@ -1,4 +1,4 @@
-"""The full-Moon sky and the turn from the sky to the instrument frame.
+"""The full-Moon sky.
 
 Single Rayleigh scattering (Paper II of WALOP-South, section on the Moon sky):
 
@@ -31,6 +31,7 @@ from jaxtyping import Float
 from walop_jax.data.checks import EPHEMERIS_MJD
 from walop_jax.data.records import Site
 from walop_jax.io.errors import fail
+from walop_jax.sky.position_angles import sky_to_instrument
 
 Values = Float[np.ndarray, " e"]
 """One of every exposure; angles in degrees, times in UTC days (MJD)."""
@@ -179,16 +180,3 @@ def rayleigh_sky(
     cos_gamma = k_n * moon_n + k_e * moon_e + k_c * moon_c
     weight = 1.0 / (1.0 + cos_gamma**2)
     return sky_to_instrument(weight * (a**2 - b**2), weight * (2.0 * a * b), rotator)
-
-
-def sky_to_instrument(
-    q: Float[np.ndarray, ...], u: Float[np.ndarray, ...], rotator: Float[np.ndarray, ...]
-) -> tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]:
-    """Turn equatorial Stokes parameters (position angle north through east) into the instrument frame.
-
-    EVPA in the instrument frame = position angle on the sky − R, hence q = Q cos 2R + U sin 2R and
-    u = U cos 2R − Q sin 2R. `rotator`, R, in degrees, broadcast against q and u. The inverse is the same with −R.
-    """
-    angle = np.deg2rad(2.0 * np.asarray(rotator, dtype=np.float64))
-    cos_2r, sin_2r = np.cos(angle), np.sin(angle)
-    return q * cos_2r + u * sin_2r, u * cos_2r - q * sin_2r
