@@ -206,7 +206,7 @@ MOST_LINES = {
     "posterior": 2182,
     "science": 5921,
     "diagnosis": 7904,
-    "nights": 2549,
+    "nights": 2543,
     "plans": 2219,
     "paper": 775,
     "reports": 2663,

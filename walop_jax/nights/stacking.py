@@ -215,16 +215,16 @@ def calibration_of_stars(survey: Survey, stars: InputTable, *, force: bool = Fal
     return survey.at(0.5 * (low + high), force=force)
 
 
-def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
+def _opened(given: Given, catalogue: Sequence[EffectKind]) -> _Opened:
     """Nights, or data that they can be made of, with the fit, breaks and events that come with them."""
-    if isinstance(one, Night):
-        return _Opened([one])
-    if isinstance(one, FitResult):
-        product = Calibration.from_fit(one)
-        return _Opened([], Data(one.calset, data_hash(one.calset), product.model), product)
-    if isinstance(one, CalibrationSet):
-        return _Opened([], Data(one, data_hash(one)))
-    path = one.folder if isinstance(one, RunFolder) else Path(one)
+    if isinstance(given, Night):
+        return _Opened([given])
+    if isinstance(given, FitResult):
+        product = Calibration.from_fit(given)
+        return _Opened([], Data(given.calset, data_hash(given.calset), product.model), product)
+    if isinstance(given, CalibrationSet):
+        return _Opened([], Data(given, data_hash(given)))
+    path = given.folder if isinstance(given, RunFolder) else Path(given)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         fit = read_calibration(path / REFERENCE, catalogue) if (path / REFERENCE).exists() else None
         folder = RunFolder(path)
@@ -236,7 +236,7 @@ def _opened(one: Given, catalogue: Sequence[EffectKind]) -> _Opened:
     if "NIGHTVER" in keywords:
         return _Opened(read_nights(path))
     if path.is_dir() or "PRODVERS" in keywords:
-        run = one if isinstance(one, Run) else Run(path if path.is_dir() else path.parent, catalogue)
+        run = given if isinstance(given, Run) else Run(path if path.is_dir() else path.parent, catalogue)
         return _Opened([], Data(run, data_hash(run.calset)), run.calibration)
     with check_input(path).open("rb") as raw:
         return _Opened([], Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest()))
