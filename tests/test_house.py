@@ -206,7 +206,7 @@ MOST_LINES = {
     "posterior": 2182,
     "science": 5964,
     "diagnosis": 7919,
-    "nights": 2590,
+    "nights": 2584,
     "plans": 2347,
     "paper": 776,
     "reports": 2690,

@@ -40,6 +40,7 @@ SURE = 5.0  # standard errors that keep one name from another
 MOST = 40  # breaks that are looked for
 ROUNDS = 3  # in which all are named again
 KINDS = ("step", "bad night", "drift")
+STEP, BAD_NIGHT, DRIFT = range(len(KINDS))
 Carried = Callable[[Parameter], bool]  # true for a candidate that stars can be corrected for
 
 
@@ -160,30 +161,26 @@ def _largest(
     p_value = tried.chance(abs(float(z[cell, i])))
     if p_value >= chance:
         return None
-    low = 0 if kind == 2 else max(cell - 1, 0)
-    near = z[low : None if kind == 2 else cell + 2] ** 2
+    low = max(cell - 1, 0)
+    near = z[low : cell + 2] ** 2
     alike = [int(j) for j in np.argsort(-near.max(axis=0)) if near[:, j].max() > z[cell, i] ** 2 - RIVAL]
     chosen = next((j for j in alike if carried is None or carried(data.parameters[j])), i)
     if chosen != i:
         i, cell = chosen, low + int(near[:, chosen].argmax())
     rivals = [j for j in alike if j != i]
     best, p, scale = float(z[cell, i] ** 2), data.parameters[i], float(data.equations.scale[i])
-    first, span, before, after = _dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES)
     members = {data.parameters[j].part for j in (i, *rivals)}
     remedies = [effect.separated_by for effect in catalogue if effect.name in members and effect.separated_by]
     information = float(tried.information[kind][cell, i])
     change = Break(
         kind=KINDS[kind],
         name=p.name,
-        unit=f"{p.unit}/yr".lstrip("/") if kind == 2 else p.unit,
+        unit=f"{p.unit}/yr".lstrip("/") if kind == DRIFT else p.unit,
         size=float(tried.score[kind][cell, i]) / information * scale,
         error=scale / math.sqrt(information),
         z=float(z[cell, i]),
         p_value=p_value,
-        night=first,
-        nights=span,
-        before=before,
-        after=after,
+        **_dates(data, solution, kind, cell, z[:, i] ** 2 > best - DATES),
         alike=tuple(data.names[j] for j in rivals),
         separated_by=tuple(dict.fromkeys(remedies)) if rivals else (),
     )
@@ -200,22 +197,22 @@ def _course(data: Together, change: Break) -> Float[np.ndarray, " u"]:
     return change.form(float(mjd.mean())).at(mjd)
 
 
-def _dates(
-    data: Together, solution: Solution, kind: int, cell: int, may: np.ndarray
-) -> tuple[int, tuple[int, int], float, float]:
-    """The first night of a change, the first and last that this may be, and the moments before and after it."""
+def _dates(data: Together, solution: Solution, kind: int, cell: int, may: np.ndarray) -> dict[str, Any]:
+    """The fields of a `Break` that say when; `may`: the cells that it may begin with."""
     cells, nights = solution.system.cells, data.nights
     numbers = [nights[entry.units[0]].number for entry in cells]
-    if kind == 2:
-        return numbers[0], (numbers[0], numbers[-1]), math.nan, math.nan
+    if kind == DRIFT:
+        span = numbers[0], numbers[-1]
+        return {"night": numbers[0], "nights": span, "before": math.nan, "after": math.nan}
     begin = [min(nights[u].begin for u in entry.units) for entry in cells]
     end = [max(nights[u].end for u in entry.units) for entry in cells]
     before, after = end[cell - 1] if cell else begin[cell] - 1.0, begin[cell]
-    if kind == 1:
+    if kind == BAD_NIGHT:
         later = begin[cell + 1] if cell + 1 < len(cells) else end[cell] + 1.0
         before, after = 0.5 * (before + after), 0.5 * (end[cell] + later)
     possible = np.flatnonzero(may)
-    return numbers[cell], (numbers[possible[0]], numbers[possible[-1]]), before, after
+    span = numbers[possible[0]], numbers[possible[-1]]
+    return {"night": numbers[cell], "nights": span, "before": before, "after": after}
 
 
 def _nights_needed(
@@ -232,9 +229,9 @@ def _nights_needed(
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
 
-def _held_out(data: Together, laws: Laws, one: Break) -> float:
+def _held_out(data: Together, laws: Laws, entry: Break) -> float:
     """Gain in χ² of every other night by the size that the others give; NaN where that cannot be asked."""
-    i, halves = data.names.index(one.name), []
+    i, halves = data.names.index(entry.name), []
     for odd in (0, 1):
         keep = data.equations.night % 2 == odd
         half = data.equations.only(keep)
@@ -243,7 +240,7 @@ def _held_out(data: Together, laws: Laws, one: Break) -> float:
             solution = solved(dataclasses.replace(data, equations=half), half_laws)
         except UndeterminedError:
             return math.nan
-        score, half_information = changes.weighted(solution, _course(data, one)[keep, None], np.array([i]))
+        score, half_information = changes.weighted(solution, _course(data, entry)[keep, None], np.array([i]))
         halves.append((float(score[0]), float(half_information[0, 0])))
     (score, half_information), (other_score, information) = halves
     if not half_information > 0 or not information > 0:

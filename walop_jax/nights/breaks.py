@@ -80,28 +80,28 @@ def solved(data: Together, laws: Laws) -> Solution:
     return solve(System.of(data.equations, laws, data.mean, data.width, data.has_value))
 
 
-def among_globals(data: Together, solution: Solution, one: Break) -> Float[np.ndarray, " g"]:
+def among_globals(data: Together, solution: Solution, entry: Break) -> Float[np.ndarray, " g"]:
     """The size of a break, which is a law, as a sum of global unknowns: their weights."""
-    system, i = solution.system, data.names.index(one.name)
-    form, law = one.form(float(data.equations.mjd.mean())), system.laws[i]
+    system, i = solution.system, data.names.index(entry.name)
+    form, law = entry.form(float(data.equations.mjd.mean())), system.laws[i]
     change = np.array([float((f.kind, f.start) == (form.kind, form.start)) for f in system.forms])
     # Intervals have values before and after, and no change.
-    if one.kind == "step" and law is not None and law.base == "interval":
+    if entry.kind == "step" and law is not None and law.base == "interval":
         change -= [f.stop == form.start for f in system.forms]
     return np.where(system.at == i, change, 0.0)
 
 
-def at_solution(data: Together, solution: Solution, one: Break) -> Break:
+def at_solution(data: Together, solution: Solution, entry: Break) -> Break:
     """A break with the size that a solution under its law gives it."""
-    change, scale = among_globals(data, solution, one), data.equations.scale[data.names.index(one.name)]
+    change, scale = among_globals(data, solution, entry), data.equations.scale[data.names.index(entry.name)]
     size, error = change @ solution.shared, math.sqrt(change @ solution.covariance @ change)
-    return dataclasses.replace(one, size=float(scale * size), error=float(scale * error))
+    return dataclasses.replace(entry, size=float(scale * size), error=float(scale * error))
 
 
-def with_breaks(data: Together, laws: Laws, found: Sequence[Break]) -> tuple[Law | None, ...]:
+def with_breaks(data: Together, laws: Laws, breaks: Sequence[Break]) -> tuple[Law | None, ...]:
     """Laws with breaks."""
     changed = list(laws)
-    for entry in found:
+    for entry in breaks:
         i = data.names.index(entry.name)
         changed[i] = entry.law(changed[i], gauge=bool(data.gauge[i]))
     return tuple(changed)

@@ -139,12 +139,9 @@ def _nights(opened: OpenFile) -> list[Night]:
     return nights
 
 
-def nights_in(place: str | os.PathLike[str]) -> list[Night]:
-    """The nights of a file, or of all files of a folder (RUN, or a folder of night files). `DataError` for none."""
-    path = Path(place)
-    if not path.is_dir():
-        return read_nights(path)
-    files = [path / NIGHTS] if (path / NIGHTS).exists() else sorted(path.glob("night*.fits"))
+def nights_in(folder: Path) -> list[Night]:
+    """The nights of all files of a folder (a SURVEY, or a folder of night files). `DataError` for none."""
+    files = [folder / NIGHTS] if (folder / NIGHTS).exists() else sorted(folder.glob("night*.fits"))
     if not files:
-        raise fail("holds no nights", file=place, advice="give sets, RUNs of walop-jax refit or a SURVEY")
+        raise fail("holds no nights", file=folder, advice="give sets, RUNs of walop-jax refit or a SURVEY")
     return [night for file in files for night in read_nights(file)]

@@ -151,23 +151,23 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
 
-def _opened(one: Given, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data | None]:
+def _opened(given: Given, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data | None]:
     """Nights that are kept, or a fit and data that they can be made of."""
-    if isinstance(one, Night):
-        return Kept([one]), None
-    if isinstance(one, FitResult):
-        product = Calibration.from_fit(one)
-        return Kept(fit=product), Data(one.calset, data_hash(one.calset), product.model)
-    if isinstance(one, CalibrationSet):
-        return Kept(), Data(one, data_hash(one))
-    path = one.folder if isinstance(one, RunFolder) else Path(one)
+    if isinstance(given, Night):
+        return Kept([given]), None
+    if isinstance(given, FitResult):
+        product = Calibration.from_fit(given)
+        return Kept(fit=product), Data(given.calset, data_hash(given.calset), product.model)
+    if isinstance(given, CalibrationSet):
+        return Kept(), Data(given, data_hash(given))
+    path = given.folder if isinstance(given, RunFolder) else Path(given)
     if path.is_dir() and (not (path / PRODUCT).exists() or (path / NIGHTS).exists()):
         return kept_in(path, catalogue), None
     keywords = () if path.is_dir() else primary_keywords(path)
     if "NIGHTVER" in keywords:
         return Kept(read_nights(path)), None
     if path.is_dir() or "PRODVERS" in keywords:
-        run = one if isinstance(one, Run) else Run(path if path.is_dir() else path.parent, catalogue)
+        run = given if isinstance(given, Run) else Run(path if path.is_dir() else path.parent, catalogue)
         return Kept(fit=run.calibration), Data(run, data_hash(run.calset))
     with check_input(path).open("rb") as raw:
         return Kept(), Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest())

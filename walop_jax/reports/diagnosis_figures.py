@@ -219,17 +219,17 @@ _STEPS = (0.0, 1.0, 2.0, thresholds.SEPARATION, 4.0, 5.0, 6.0)
 
 
 @styled
-def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
+def protection_figure(limits: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     """Largest error of q and u by a single effect that goes undetected; crosses: not both in one exposure."""
     figure, axis = on.single(5.0, 3.8)
-    percent = 100.0 * found.protection
-    if found.worst is None:
+    percent = 100.0 * limits.protection
+    if limits.worst is None:
         axis.text(0.5, 0.5, NO_LEVEL, ha="center", transform=axis.transAxes)
         axis.set_axis_off()
         return figure
     least, largest = float(np.nanmin(percent)), float(np.nanmax(percent))
     norm = LogNorm(least, max(largest, 1.2 * least))
-    shown = style.error_map(axis, "largest error that goes undetected", found.x, found.y, percent, norm)
+    shown = style.error_map(axis, "largest error that goes undetected", limits.x, limits.y, percent, norm)
     style.colour_bar(shown, "error of q, u (%)")
     if np.isnan(percent).any():
         figure.legend(frameon=False, loc=style.ABOVE)
@@ -237,13 +237,13 @@ def protection_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
 
 
 @styled
-def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
+def separation_figure(limits: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     """Separation (σ) of effects (columns) from each one at its detection limit (rows); far ones are counted."""
-    alike = found.separation + np.where(np.eye(len(found.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
+    alike = limits.separation + np.where(np.eye(len(limits.effects), dtype=bool), np.inf, 0.0) < _STEPS[-1]
     confusable = np.flatnonzero((alike | alike.T).any(axis=0))
-    confusable = confusable if confusable.size else np.arange(len(found.effects))
-    count, names = len(confusable), [found.effects[i] for i in confusable]
-    separation = found.separation[np.ix_(confusable, confusable)]
+    confusable = confusable if confusable.size else np.arange(len(limits.effects))
+    count, names = len(confusable), [limits.effects[i] for i in confusable]
+    separation = limits.separation[np.ix_(confusable, confusable)]
     width = on.width or np.inf
     narrow = width < style.NARROW
     size = max(1.5, 0.17 * count)
@@ -256,7 +256,7 @@ def separation_figure(found: DetectionLimits, on: Canvas = PAGE) -> AnyFigure:
     axis.set_xticks(range(count), numbers if narrow else names, rotation=90, fontsize=style.SMALL)
     axis.set_yticks(range(count), rows, fontsize=style.SMALL)
     axis.set(xlabel="could be mistaken for", ylabel="effect present\n(at its detection limit)")
-    if omitted := len(found.effects) - count:
+    if omitted := len(limits.effects) - count:
         axis.set_title(f"{omitted} other effects:{gap}more than {_STEPS[-1]:g} σ from all")
     label = f"separation (σ),{gap}below {thresholds.SEPARATION:g}: can be mistaken"
     if narrow:

@@ -78,21 +78,21 @@ def nights_figure(document: Mapping[str, Any], on: Canvas = PAGE) -> Figure:
 
 
 @styled
-def watch_figure(found: Watch) -> Figure:
+def watch_figure(watch: Watch) -> Figure:
     """Gain of every camera since the calibration (%) by group; band: smallest step seen in 99 %, lines: changes."""
-    count = len(found.cameras)
+    count = len(watch.cameras)
     figure, axes = PAGE.panels(6.0, 1.1 + 1.3 * count, count, 1, sharex=True, sharey=True)
-    time, named = day_of(found.time), {change.camera for change in found.changes}
-    percent = (100.0 * values.T for values in (found.gain, found.error, found.smallest))
-    for axis, camera, gain, error, detectable in zip(axes[:, 0], found.cameras, *percent, strict=True):
+    time, named = day_of(watch.time), {change.camera for change in watch.changes}
+    percent = (100.0 * values.T for values in (watch.gain, watch.error, watch.smallest))
+    for axis, camera, gain, error, detectable in zip(axes[:, 0], watch.cameras, *percent, strict=True):
         axis.fill_between(time, -detectable, detectable, color=QUIET, lw=0)
         colour = BEFORE if camera in named else AFTER
         axis.errorbar(time, gain, error, fmt="o", ms=3, lw=1, color=colour)
-        for change in found.changes:
+        for change in watch.changes:
             axis.axvline(float(day_of(change.time)), color=BEFORE, lw=0.8, ls="--")
         axis.set_ylabel(f"{camera} (%)")
     axes[0, 0].set_title("gain since the calibration; grey: steps too small to be detected")
-    calendar(axes[-1, 0], found.time, "number of the exposure group")
+    calendar(axes[-1, 0], watch.time, "number of the exposure group")
     return figure
 
 
