@@ -29,10 +29,6 @@ class Linear:
         """No trials of what has no linear step."""
         return (), {}
 
-    def decided(self, trials: list[Trial]) -> list[Trial]:
-        """Trials, best first, with those of even odds in their order."""
-        return trials
-
     def confronted(self, evidence: Evidence, trial: Trial) -> Trial:
         """The trial as it is: a score space has no rows that could have been left out."""
         return trial

@@ -18,7 +18,7 @@ from walop_jax.diagnosis.examination import Evidence, upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
@@ -296,36 +296,3 @@ def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, e
     reason = search.refused(state, exact.Trial(effect, 50.0, chi2 - explained, noise=False))
     assert (reason == "") is told
     assert told or f"explains {explained:.4g} of {chi2 - 10_000:.4g} that are missing" in reason
-
-
-def test_decided_keeps_every_trial_once(monkeypatch):
-    """Names of evidence 10, 8.9 and 6.9, and a sentence of 9.8, which needs 3 more than a name and so comes last.
-
-    Fitted with errors as stated the second name is better by χ² 8 than the first, and the sentence by 2: the sentence
-    at 9.8 − ½ · 6 = 6.8 stays behind the name.
-    """
-    objective = {"first": 100.0, "second": 92.0, "said": 98.0, "third": 90.0}
-
-    def result(name, scale=30.0):
-        found = object.__new__(FitResult)
-        expansion = SimpleNamespace(objective=objective[name], noise_scale=scale)
-        vars(found).update(likelihood=name, values=None, expansion=expansion)
-        return found
-
-    def trial(name, evidence, effect):
-        return exact.Trial(effect, evidence, 0.0, False, fit=result(name))
-
-    monkeypatch.setattr(refits, "fit", lambda likelihood, **_: result(likelihood, 1.0))
-    names = [effect_by_name(name) for name in ("blemish", "clp_zero", "hwp1_axis")]
-    trials = [
-        trial("first", 10.0, names[0]),
-        trial("second", 8.9, names[1]),
-        trial("third", 6.9, names[2]),
-        trial("said", 9.8, Described),
-    ]
-    assert trials == sorted(trials, key=search.names_first)
-    ordered = refits.Refits.decided(Mock(refits.Refits), list(trials))
-    assert [one.fit.likelihood for one in ordered] == ["second", "first", "said", "third"]
-    assert [one.evidence for one in ordered] == pytest.approx([8.9, 6.0, 6.8, 6.9], abs=1e-12)
-    one = [trials[0], *trials[2:3]]
-    assert refits.Refits.decided(Mock(refits.Refits), one) == one

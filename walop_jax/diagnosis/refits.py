@@ -26,7 +26,7 @@ from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.diagnosis.search import State, names_first
+from walop_jax.diagnosis.search import State
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.io.progress import Stage
@@ -131,20 +131,6 @@ class Refits:
         if against:
             self.tell(f"{trial.name}: exposures of {against} speak against it")
         return dataclasses.replace(trial, compared=compared, against=against)
-
-    def decided(self, trials: list[Trial]) -> list[Trial]:
-        """Trials in order of evidence; what scaled errors leave even at the top is decided with errors as stated."""
-        even = [trial for trial in trials if trials[0].evidence - trial.evidence < thresholds.EVEN_ODDS]
-        fits = [trial.fit for trial in even if trial.fit is not None and trial.fit.noise_scale > 1.0]
-        if len(even) < 2 or len(fits) < len(even):
-            return trials
-        exact = [fit(scaled.likelihood, start=scaled.values, noise_scale=1.0) for scaled in fits]
-        best, clearly = min(again.expansion.objective for again in exact), []
-        for trial, again in zip(even, exact, strict=True):
-            evidence = trial.evidence - 0.5 * (again.expansion.objective - best)
-            clearly.append(dataclasses.replace(trial, fit=again, evidence=evidence))
-        remaining = [trial for trial in trials if all(trial is not t for t in even)]
-        return [*sorted(clearly, key=names_first), *remaining]
 
     def adopted(self, state: State, trial: Trial) -> State:
         """The state with the model of a trial, fitted again where priors or errors were in its way."""

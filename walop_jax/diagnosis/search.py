@@ -77,7 +77,6 @@ Judge = Any
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
 fitted      a linear trial as the judge finds it
 others      trials of effects without a linear step, and other descriptions of the instrument that were compared
-decided     trials in order of evidence, with those that are even decided
 confronted  a trial with what data that took no part in its fit say of it
 adopted     the state once a trial has joined the model
 """
@@ -127,13 +126,11 @@ def refused(evidence: Evidence, trial: Trial) -> str:
 
 def _least_explained(evidence: Evidence, trial: Trial) -> float:
     """Part of the excess of χ² that an addition must explain."""
-    missing = evidence.chi2 - evidence.dof
-    least = thresholds.LEAST_SHARE * missing
     # Of a poor fit the final model is asked (`thresholds.PART`): its misfit may have many causes.
     if evidence.poor or trial.effect is Described:
-        return least
-    surely = missing - 2.0 * np.sqrt(2.0 * evidence.dof)
-    return max(least, thresholds.LEAST_SHARE_OF_NAME * surely)
+        return 0.0
+    surely = evidence.chi2 - evidence.dof - 2.0 * np.sqrt(2.0 * evidence.dof)
+    return thresholds.LEAST_SHARE_OF_NAME * surely
 
 
 def hopeless(evidence: Evidence, trial: Trial) -> str:
@@ -149,7 +146,7 @@ def linear_trials(evidence: Evidence) -> list[Trial]:
     """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
     names = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
     best = max((item.log_bayes for item in evidence.significant), default=-np.inf)
-    return sorted([*names, *_sentences(evidence, best)], key=names_first)
+    return sorted([*names, *_sentences(evidence, best)], key=_by_evidence)
 
 
 def _sentences(evidence: Evidence, least: float, tried: Sequence[Trial] = ()) -> list[Trial]:
@@ -168,9 +165,8 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, linear=linear)
 
 
-def names_first(trial: Trial) -> float:
-    """Order of trials: by evidence, but a sentence only where it is clearly more probable than a name."""
-    return -trial.evidence + (thresholds.EVEN_ODDS if trial.effect is Described else 0.0)
+def _by_evidence(trial: Trial) -> float:
+    return -trial.evidence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,18 +187,17 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
     evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
     waiting = log.passed(linear_trials(evidence), hopeless)
-    tried, accepted, confirmed, ended = list(waiting), None, [], ""
+    tried, accepted, ended = list(waiting), None, ""
     others_asked = sentences_asked = False
     while accepted is None:
-        new: list[Trial] = []
+        passed: list[Trial] = []
         while waiting and not (ended := judge.over(fits)):
             linear, fits = waiting.pop(0), fits + 1
             if fitted := log.passed([judge.fitted(evidence, linear)], refused):
-                new += fitted
+                passed += fitted
                 tried = [fitted[0] if candidate is linear else candidate for candidate in tried]
                 if _is_sure(fitted[0], waiting):
                     break
-        passed = [*new, *confirmed]
         # Names that came first by linear steps were refused: these steps were inaccurate.
         if not (passed or sentences_asked):
             sentences_asked = True
@@ -218,19 +213,11 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             fits += len(alternatives)
             alternatives = log.passed(alternatives, refused)
             passed, tried = [*passed, *alternatives], [*tried, *alternatives]
-        for trial in judge.decided(sorted(passed, key=names_first)):
+        for trial in sorted(passed, key=_by_evidence):
             if accepted := next(iter(log.passed([judge.confronted(evidence, trial)], refused)), None):
                 break
-        # Sentences were behind a name that was refused: they come before another one that is less probable.
-        if accepted is not None and not confirmed:
-            confirmed, item = [accepted], accepted.item
-            least = -np.inf if item is None else item.log_bayes + thresholds.EVEN_ODDS
-            waiting = log.passed(_sentences(evidence, least, tried), hopeless)
-            tried += waiting
-            accepted = None if waiting else accepted
         if not waiting or (ended := judge.over(fits)):
             break
-    accepted = accepted or next(iter(confirmed), None)
     if accepted is not None:
         ended, accepted = "", _with_rivals(evidence, accepted, tried)
     added = "" if accepted is None else accepted.name

@@ -30,15 +30,14 @@ FLOOR = 1.25  # σ of the residuals behind all candidates above which evidence c
 
 # Additions
 
-LEAST_SHARE = 0.1  # share of the misfit that an addition must explain; no gain where the fit is not poor
 # Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
 LEAST_SHARE_OF_NAME = 0.25
 # Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added; and
 # by which another reading of the data must, to be reported.
 PART = 10.0
 HOPEFUL = 1.0  # standard errors by which the linear step of a sentence must predict unseen settings better
-# Difference in evidence that is no preference; a description needs that much more than a name. More loss in ln p of
-# the exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
+# Difference in evidence that is no preference. More loss in ln p of the exposures of one KIND, as those of others
+# predict them, and in −χ²/2 of that, contradicts an addition.
 EVEN_ODDS = 3.0
 # Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
 # class are averaged.
