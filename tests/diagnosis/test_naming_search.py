@@ -130,4 +130,4 @@ def test_a_description_comes_before_a_less_probable_name_once_the_best_name_is_r
     here = dataclasses.replace(here, probes=[here.probes[0], here.probes[2]], sentences=[description])
     judge = Refusing()
     assert names(here, judge)[0] == Described.name
-    assert judge.fits[:3] == [NAMES[0], NAMES[2], Described.name]
+    assert judge.fits[:2] == [NAMES[0], Described.name]

@@ -45,8 +45,8 @@ ERRORS = (
     planted("io/text.py", "places = 1 - math.floor", "places = 2 - math.floor", "io/test_rounding.py"),
     planted("io/fits_reading.py", "_MOST = 999", "_MOST = 9999", "data/test_hostile_headers.py"),
     # data
-    planted("data/table_intensities.py", "2 * np.bincount(row, again) > ", "4 * np.bincount(row, again) > ", _REPEATS),
-    planted("data/table_intensities.py", "[block.x[at], block.y[at], *block", "[block.x[at], *block", _REPEATS),
+    planted("data/repeats.py", "2 * np.bincount(row, again) > ", "4 * np.bincount(row, again) > ", _REPEATS),
+    planted("data/repeats.py", "[block.x[at], block.y[at], *block", "[block.x[at], *block", _REPEATS),
     planted("data/checks.py", "refuse(np.abs(table[name]) > limit, f", "refuse(table[name] > limit, f",
             "data/test_bad_inputs.py"),
     planted("data/table_intensities.py", "isfinite(sigma) & (sigma <= 0)", "isfinite(sigma) & (sigma < 0)",
@@ -57,7 +57,7 @@ ERRORS = (
     planted("data/inspection.py", "sigma**2 / np.where(counts > 0, counts, 1.0)",
             "sigma / np.where(counts > 0, counts, 1.0)", "commands/test_commands.py"),
     # sky
-    planted("sky/moon.py", "u * cos_2r - q * sin_2r", "u * cos_2r + q * sin_2r", "sky/test_moon.py"),
+    planted("sky/position_angles.py", "u * cos_2r - q * sin_2r", "u * cos_2r + q * sin_2r", "sky/test_moon.py"),
     planted("sky/moon.py", "weight = 1.0 / (1.0 + cos_gamma**2)", "weight = 1.0 / (1.0 - cos_gamma**2)",
             "sky/test_moon.py"),
     planted("sky/moon.py", "a = v_n - k_n / (1.0 + k_c) * v_c", "a = v_n + k_n / (1.0 + k_c) * v_c",
@@ -169,7 +169,7 @@ ERRORS = (
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "- np.log1p(value)", "+ np.log1p(value)", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "t * s**2", "s**2", "diagnosis/test_score.py"),
-    planted("diagnosis/search.py", "missing - 2.0 * np.sqrt", "missing + 2.0 * np.sqrt",
+    planted("diagnosis/search.py", "evidence.dof - 2.0 * np.sqrt", "evidence.dof + 2.0 * np.sqrt",
             "diagnosis/test_judging.py"),
     planted("diagnosis/exact.py", "information - np.diag(width**-2.0)", "information", "diagnosis/test_judging.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),

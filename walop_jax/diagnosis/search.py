@@ -4,7 +4,8 @@ All is functions of a `State`, which never changes. `refused` has all rules by w
 is the loop. What differs between the search that fits (`refits.Refits`) and the one of the blind study, which takes
 linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
 
-1. Candidates are ordered by their linear evidence. Candidates that their linear step would refuse are not tried.
+1. Candidates are ordered by their linear evidence: names, and descriptions that are more probable than every name that
+   is not refused. Candidates that their linear step would refuse are not tried.
 2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
    linear step by more than `thresholds.LINEAR_GOOD`, rivals that lie within twice the difference are fitted as well.
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
@@ -142,20 +143,6 @@ def hopeless(evidence: Evidence, trial: Trial) -> str:
     return refused(evidence, dataclasses.replace(trial, evidence=factor * trial.evidence, left=remaining))
 
 
-def linear_trials(evidence: Evidence) -> list[Trial]:
-    """The leading names, and sentences that are more probable than every name, by linear steps; best first."""
-    names = [linear_trial(evidence, item) for item in leaders(evidence.significant)]
-    best = max((item.log_bayes for item in evidence.significant), default=-np.inf)
-    return sorted([*names, *_sentences(evidence, best)], key=_by_evidence)
-
-
-def _sentences(evidence: Evidence, least: float, tried: Sequence[Trial] = ()) -> list[Trial]:
-    """The leading sentences with an evidence above `least`, without those that were tried, by linear steps."""
-    probable = (item for item in evidence.significant_sentences if item.log_bayes > least)
-    untried = [item for item in probable if not any(item is trial.item for trial in tried)]
-    return [linear_trial(evidence, item) for item in untried[: thresholds.MOST_SENTENCES]]
-
-
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
@@ -176,6 +163,15 @@ class _Log:
     evidence: Evidence
     trials: dict[str, Trial] = dataclasses.field(default_factory=dict)
 
+    def sentences(self, names: Iterable[Trial]) -> list[Trial]:
+        """The leading sentences that are more probable than names and have not been tried; a few of a round."""
+        least = max((name.item.log_bayes for name in names if name.item is not None), default=-np.inf)
+        count = sum(trial.effect is Described for trial in self.trials.values())
+        most = min(thresholds.MOST_SENTENCES, 2 * thresholds.MOST_SENTENCES - count)
+        untried = (item for item in self.evidence.significant_sentences if item.name not in self.trials)
+        probable = [item for item in untried if item.log_bayes > least]
+        return self.passed((linear_trial(self.evidence, item) for item in probable[:most]), hopeless)
+
     def passed(self, trials: Iterable[Trial], why: Callable[[Evidence, Trial], str]) -> list[Trial]:
         """The trials that are not refused; all are noted."""
         judged = [dataclasses.replace(trial, refused=why(self.evidence, trial)) for trial in trials]
@@ -186,25 +182,22 @@ class _Log:
 def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
     evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
-    waiting = log.passed(linear_trials(evidence), hopeless)
-    tried, accepted, ended = list(waiting), None, ""
-    others_asked = sentences_asked = False
+    waiting = log.passed((linear_trial(evidence, item) for item in leaders(evidence.significant)), hopeless)
+    tried, accepted, others_asked, ended = list(waiting), None, False, ""
     while accepted is None:
         passed: list[Trial] = []
-        while waiting and not (ended := judge.over(fits)):
+        while not (ended := judge.over(fits)):
+            # Where names are refused, descriptions were behind them that are more probable than those that remain.
+            more = log.sentences(trial for trial in (*passed, *waiting) if trial.effect is not Described)
+            tried, waiting = [*tried, *more], sorted([*waiting, *more], key=_by_evidence)
+            if not waiting:
+                break
             linear, fits = waiting.pop(0), fits + 1
             if fitted := log.passed([judge.fitted(evidence, linear)], refused):
                 passed += fitted
                 tried = [fitted[0] if candidate is linear else candidate for candidate in tried]
                 if _is_sure(fitted[0], waiting):
                     break
-        # Names that came first by linear steps were refused: these steps were inaccurate.
-        if not (passed or sentences_asked):
-            sentences_asked = True
-            waiting = log.passed(_sentences(evidence, -np.inf, tried), hopeless)
-            tried += waiting
-            if waiting:
-                continue
         missing = evidence.chi2 - evidence.dof
         explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in passed)
         if not others_asked and not explained and (evidence.poor or not passed):
