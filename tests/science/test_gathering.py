@@ -522,7 +522,13 @@ def test_units_of_fluxes_and_errors(tmp_path, units_of, gain, factor, message):
 
 @pytest.mark.parametrize(
     ("unit", "gain", "factor"),
-    [("", 2.0, 2.0), ("kct", 2.0, 2e3), ("ct / pixel", 2.0, 2.0), ("electron", 2.0, None), ("electron", None, None)],
+    [
+        ("", 2.0, 2.0),
+        ("kct", 2.0, 2e3),
+        ("ct / pixel", 2.0, 2.0),
+        ("electron", 2.0, None),
+        ("electron", None, None),
+    ],
 )
 def test_units_of_the_level_of_the_sky(tmp_path, unit, gain, factor):
     """The level is in counts or in electrons as the fluxes are, in a unit of its own."""
@@ -533,7 +539,9 @@ def test_units_of_the_level_of_the_sky(tmp_path, unit, gain, factor):
         columns[name].unit = "ct"
     columns.write(tmp_path / "a.ecsv")
     if factor is None:
-        with pytest.raises(DataError, match="BACKGROUND: is in electron, FLUX_AUTO in ct; give both in counts"):
+        with pytest.raises(
+            DataError, match="BACKGROUND: is in electron, FLUX_AUTO in ct; give both in counts"
+        ):
             read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)
     else:
         read = read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 import walop_jax.science.epoch
 from walop_jax.calibration.accuracy import sample_stars
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.certify import certify, validity
-from walop_jax.calibration.product import write_calibration
+from walop_jax.calibration.certify import certify
+from walop_jax.calibration.product import validity, write_calibration
 from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.base_model import base_model, model_for

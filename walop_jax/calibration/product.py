@@ -12,10 +12,11 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from astropy.io import fits
+from jaxtyping import Float
 
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
@@ -89,7 +90,24 @@ _WORDS = re.compile(
 _AGAIN = "make the product again"
 _NEWER = "use a newer walop-jax, or make the product again with this one"
 
-Cards = dict[str, tuple[Any, str]]
+
+class Validity(NamedTuple):
+    """Range of application of a calibration: MJD of its exposures, their filters, their temperatures (Celsius)."""
+
+    mjd: tuple[float, float]
+    filters: tuple[str, ...]
+    temperature: tuple[float, float]
+
+
+def validity(product: Product) -> Validity:
+    """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
+    e = product.exposures
+    return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
+
+
+def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (float("nan"), float("nan"))
 
 
 # ------------------------------------------------------------------------------------------------- writing
@@ -189,19 +207,19 @@ def _strings(values: Iterable[str]) -> np.ndarray:
 
 def _primary(c: Product) -> fits.PrimaryHDU:
     """The primary header: verdict, validity, software, content hash."""
-    verdict, site, structure = c.verdict, c.site, c.verdict.structure
+    verdict, structure, span = c.verdict, c.verdict.structure, validity(c)
     newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
     version = 1 if not newer and np.isin(c.exposures.kind, _FIRST_KINDS).all() else PRODVERS
-    cards: Cards = {
-        "TELESCOP": (site.telescope, ""),
+    cards: dict[str, tuple[Any, str]] = {
+        "TELESCOP": (c.site.telescope, ""),
         "INSTRUME": (c.instrument, ""),
         "PRODVERS": (version, "version of the calibration product format"),
         "ORIGIN": (c.origin, ""),
         "CREATOR": ("walop-jax", ""),
         "DATE": (c.date, "UTC, when the product was made"),
-        "SITELAT": (site.latitude, "[deg] latitude"),
-        "SITELONG": (site.longitude, "[deg] longitude, east positive"),
-        "SITEELEV": (site.elevation, "[m] elevation"),
+        "SITELAT": (c.site.latitude, "[deg] latitude"),
+        "SITELONG": (c.site.longitude, "[deg] longitude, east positive"),
+        "SITEELEV": (c.site.elevation, "[m] elevation"),
         "TRUSTED": (verdict.trusted, "converged and explains the data"),
         "CONVERGD": (verdict.converged, "the minimum was reached"),
         "CHI2": (verdict.chi2, "chi squared of data and priors"),
@@ -215,7 +233,11 @@ def _primary(c: Product) -> fits.PrimaryHDU:
         "STRUCTR": (structure.response if structure else np.nan, "rms response of a camera to q, u there"),
         "MAPFILT": (c.maps.filter, f"filter of the maps M21...{c.maps.names[-1]}"),
         **{n: (at, "[deg] extent of the field points used") for n, at in zip(_FIELD, c.field, strict=True)},
-        **_validity_cards(c),
+        "MJD-BEG": (span.mjd[0], "[d] UTC of the exposures"),
+        "MJD-END": (span.mjd[1], "[d] UTC of the exposures"),
+        "TEMPMIN": (span.temperature[0], "[Celsius] of the exposures"),
+        "TEMPMAX": (span.temperature[1], "[Celsius] of the exposures"),
+        **{f"FILTER{n}": (name, "") for n, name in enumerate(span.filters, start=1)},
         "HASHRULE": (HASHRULE, "what CONTHASH covers"),
         "CONTHASH": ("", ""),  # when all is there
     }
@@ -228,21 +250,6 @@ def _primary(c: Product) -> fits.PrimaryHDU:
     for number, (name, release) in enumerate(c.versions.items(), start=1):
         primary.header[f"SOFT{number}"] = in_ascii(f"{name} {release}")
     return primary
-
-
-def _validity_cards(c: Product) -> Cards:
-    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES has the same."""
-    cards: Cards = {}
-    for values, names, comment in (
-        (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
-        (c.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
-    ):
-        finite = values[np.isfinite(values)]
-        if finite.size:
-            cards |= {names[0]: (float(finite.min()), comment), names[1]: (float(finite.max()), comment)}
-    for number, name in enumerate(np.unique(c.exposures.filter).tolist(), start=1):
-        cards[f"FILTER{number}"] = (name, "")
-    return cards
 
 
 def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fits.ImageHDU:

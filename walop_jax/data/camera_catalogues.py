@@ -248,7 +248,7 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
 ) -> tuple[Numbers, ...]:
-    """Fluxes, errors and, where it is stated, the level of the sky (electrons); those without a unit have the flux's."""
+    """Fluxes, errors and the level of the sky, if there is one (electrons); without a unit they have the flux's."""
     pair = _pair(source, column_map.flux)
     unused = [other[0] for other in column_map.flux if other != pair and other[0].upper() in source.names]
     names = [*pair, *[name for name in column_map.level if name.upper() in source.names][:1]]
