@@ -28,7 +28,7 @@ from walop_jax.data.kinds import CALIBRATION_PLATE, PREFIX
 from walop_jax.data.records import InputFile, Site, Sources
 from walop_jax.data.schema import Column, column_names, read_table, table_rules
 from walop_jax.data.units import Place
-from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
+from walop_jax.fit.verdict import STATED, Hidden, Mistake, Structure, Verdict
 from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import PathLike, errors_naming, fail
@@ -63,16 +63,8 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
 """Tables and their columns, EXPOSURES apart, whose columns depend on the instrument."""
 
 _RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "chi2"}
-_MISTAKE: Mapping[str, tuple[str, Any]] = {
-    "HIDE": ("names", ""),
-    "SIZE": ("sizes", None),
-    "UNIT": ("units", ""),
-    "HKIND": ("kinds", DATA),
-    "CURE": ("remedies", ""),
-    "ACTS": ("acts", ""),
-    "SEEN": ("measured", True),
-}
-"""Numbered words of HIDDEN: the field of `Hidden` that each one is, and its value where it is absent."""
+_MISTAKE = dict(zip(Mistake._fields, ("HIDE", "SIZE", "UNIT", "HKIND", "CURE", "ACTS", "SEEN"), strict=True))
+"""Numbered words of HIDDEN by the field of `Mistake` that each one is."""
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
@@ -277,11 +269,12 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
     """An image (mistake, parameter) of the shifts of the parameters by each mistake; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number in range(len(hidden)):
-        for word, (attribute, usual) in _MISTAKE.items():
-            value = getattr(hidden, attribute)[number]
-            if word != "ACTS" or value != usual:
-                hdu.header[f"{word}{number + 1}"] = in_ascii(value) if isinstance(value, str) else value
+    for number, mistake in enumerate(hidden.mistakes, start=1):
+        for field, value in mistake._asdict().items():
+            if field != "acts" or value:
+                hdu.header[f"{_MISTAKE[field]}{number}"] = (
+                    in_ascii(value) if isinstance(value, str) else value
+                )
     return hdu
 
 
@@ -522,18 +515,16 @@ class _Reader:
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
-        columns: dict[str, list[Any]] = {attribute: [] for attribute, _ in _MISTAKE.values()}
-        while f"HIDE{(number := len(columns['names']) + 1)}" in header:
-            for word, (attribute, usual) in _MISTAKE.items():
-                name = f"{word}{number}"
-                value = _number(header, name, place) if usual is None else header.get(name, usual)
-                columns[attribute].append(str(value) if isinstance(usual, str) else value)
-        count = len(columns["names"])
-        changes = self.image("HIDDEN") if count else np.zeros((0, parameters))
-        if changes.shape != (count, parameters):
-            raise place.fail(f"has shape {changes.shape}, not {(count, parameters)}", advice=_AGAIN)
-        columns["measured"] = [value is not False for value in columns["measured"]]
-        return Hidden(changes=changes, **{name: tuple(values) for name, values in columns.items()})
+        mistakes, usual = list[Mistake](), {"unit": "", **Mistake._field_defaults}
+        while f"HIDE{(number := len(mistakes) + 1)}" in header:
+            words = {field: f"{word}{number}" for field, word in _MISTAKE.items()}
+            size, seen = _number(header, words.pop("size"), place), header.get(words.pop("measured"))
+            texts = {field: str(header.get(name, usual.get(field))) for field, name in words.items()}
+            mistakes.append(Mistake(size=size, measured=seen is not False, **texts))
+        changes = self.image("HIDDEN") if mistakes else np.zeros((0, parameters))
+        if changes.shape != (len(mistakes), parameters):
+            raise place.fail(f"has shape {changes.shape}, not {(len(mistakes), parameters)}", advice=_AGAIN)
+        return Hidden(tuple(mistakes), changes)
 
     def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
         """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""
