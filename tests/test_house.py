@@ -196,21 +196,21 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1586,
     "instruments": 220,
-    "data": 5624,
+    "data": 5623,
     "sky": 436,
     "model": 9663,
     "likelihood": 3319,
     "simulation": 1089,
-    "fit": 2102,
-    "calibration": 2661,
-    "posterior": 2182,
-    "science": 5921,
-    "diagnosis": 7904,
+    "fit": 2101,
+    "calibration": 2633,
+    "posterior": 2174,
+    "science": 5891,
+    "diagnosis": 7896,
     "nights": 2549,
     "plans": 2219,
     "paper": 775,
     "reports": 2663,
-    "commands": 4062,
+    "commands": 4061,
 }
 """Lines of each room: raising one is a decision of its own."""
 

@@ -108,14 +108,13 @@ class Inspection(Displayed):
         sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
         place = ", ".join(filter(None, (self.instrument, self.telescope)))
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
-        counts = {use.prefix: (use.exposures, len(use.angles)) for use in self.elements}
-        uses = {f"element {p}": f"in {n} exposures, {angles} angles" for p, (n, angles) in counts.items()}
+        number = {use.prefix: f"{use.exposures} exposures, {len(use.angles)} angles" for use in self.elements}
         facts = {
             "instrument": f"{place} ({self.origin or 'origin not stated'})",
             "field points": f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
             "cameras": str(self.cameras),
             "polariser angles": f"{len(self.angles)} modulo 180°, widest gap {self.widest_gap:.3g}°",
-            **uses,
+            **{f"element {prefix}": f"in {uses}" for prefix, uses in number.items()},
             "used": f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
             "flagged": ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none",
             "median counts": f"{rounded(self.median_counts)} electrons" if counted else "none: all KIND flux",
