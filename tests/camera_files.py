@@ -55,7 +55,8 @@ def ldac(path: Path, columns: dict[str, np.ndarray], words=CENTRE) -> Path:
         [fits.Column("Field Header Card", f"{cards.size * 80}A", dim=f"(80, {cards.size})", array=cards)],
         name="LDAC_IMHEAD",
     )
-    objects = fits.BinTableHDU(_table(columns).as_array(), name="LDAC_OBJECTS")
+    objects = fits.table_to_hdu(_table(columns))
+    objects.name = "LDAC_OBJECTS"
     fits.HDUList([fits.PrimaryHDU(), image, objects]).writeto(path, checksum=True)
     return path
 

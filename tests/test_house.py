@@ -196,21 +196,21 @@ def test_the_core_is_reached_without_the_rest(entry):
 MOST_LINES = {
     "io": 1586,
     "instruments": 220,
-    "data": 5717,
+    "data": 5716,
     "sky": 443,
     "model": 9663,
     "likelihood": 3406,
     "simulation": 1126,
-    "fit": 2127,
-    "calibration": 2676,
-    "posterior": 2182,
-    "science": 5964,
-    "diagnosis": 7919,
+    "fit": 2126,
+    "calibration": 2647,
+    "posterior": 2174,
+    "science": 5934,
+    "diagnosis": 7876,
     "nights": 2584,
     "plans": 2347,
     "paper": 776,
     "reports": 2690,
-    "commands": 3758,
+    "commands": 3757,
 }
 """Lines of each room: raising one is a decision of its own."""
 

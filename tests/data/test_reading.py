@@ -327,3 +327,20 @@ def test_conversion_of_a_unit_is_remarked_on(handmade):
     calset = read_calibration_set(handmade.write())
     np.testing.assert_allclose(calset.points.x, [-0.2, 0.0, 0.25])
     assert any("[POINTS] X: is in arcmin, converted to deg" in remark for remark in calset.remarks)
+
+
+@pytest.mark.parametrize(
+    ("angles", "half"),
+    [
+        (np.arange(0.0, 180.0, 20.0), True),
+        (np.arange(-80.0, 90.0, 20.0), True),
+        (np.arange(0.0, 360.0, 20.0), False),
+        ([0.0, 120.0, 240.0], False),
+        ([30.0], True),
+    ],
+)
+def test_half_a_turn_of_the_polariser_is_that_on_both_sides_of_zero(angles, half):
+    counts = 1e5 * (1.0 + np.random.default_rng(0).random((20, len(angles), 4)))
+    x, y = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 20))
+    findings = inspect(from_arrays(counts, np.sqrt(counts), x, y, angles)).findings
+    assert half == any("half a turn only" in finding.what for finding in findings)

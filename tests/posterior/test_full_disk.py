@@ -22,7 +22,7 @@ WRITERS = {
         from walop_jax.posterior.files import Chain
         from walop_jax.posterior.samplers import Stretch
         def write(path):
-            there, state = Chain(path.parent, {}), {"random_keys": np.zeros(624), "random_rest": np.zeros(3)}
+            there, state = Chain(path.parent, {}), {"random": ("MT19937", np.zeros(624), 0, 0, 0.0)}
             there.path = path
             there.save([state], [Stretch(np.zeros((4, 4, 20000)), np.zeros((4, 4)), np.zeros((4, 4)))], 0.0)
     """,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
-from walop_jax.calibration.certify import Validity
+from walop_jax.calibration.product import Validity
 from walop_jax.science.commissioning import Certificate, requirements
 from walop_jax.science.field_accuracy import FieldAccuracy
 

@@ -85,13 +85,8 @@ def only(calibration: Calibration, name: str) -> Calibration:
     """The calibration with one of its mistakes."""
     hidden = calibration.hidden
     assert hidden is not None
-    at = [hidden.names.index(name)]
-    kept = {
-        field.name: tuple(getattr(hidden, field.name)[i] for i in at)
-        for field in dataclasses.fields(hidden)
-        if field.name != "changes"
-    }
-    return dataclasses.replace(calibration, hidden=Hidden(**kept, changes=hidden.changes[at]))
+    at = [mistake.name for mistake in hidden.mistakes].index(name)
+    return dataclasses.replace(calibration, hidden=Hidden((hidden.mistakes[at],), hidden.changes[[at]]))
 
 
 def star(tmp_path, calibration: Calibration, q: float, plate=None, rotator=None) -> tuple[float, float]:
@@ -132,7 +127,7 @@ def test_a_plate_that_was_never_in_the_beam_is_unknown_where_stars_are_seen_thro
 def test_what_moon_and_standards_measure_is_measured():
     design = Design.of(small_fit())
     hidden = hidden_mistakes(design, Singles.of(design))
-    assert all(hidden.measured)
+    assert all(mistake.measured for mistake in hidden.mistakes)
     found = could_hide(dataclasses.replace(Calibration.from_fit(small_fit()), hidden=hidden))
     assert [one.error[0] for one in found] == sorted((one.error[0] for one in found), reverse=True)
 

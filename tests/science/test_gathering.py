@@ -300,7 +300,7 @@ def test_pixels_go_to_the_sky_by_the_wcs_of_the_image_which_gives_the_pointing_t
     for k, name in enumerate(CAMERAS):
         columns = of_camera(STARS, k, np.random.default_rng(k))
         x, y = plane.wcs_world2pix(columns.pop("ALPHA_J2000"), columns.pop("DELTA_J2000"), 1)
-        columns["X_IMAGE"], columns["Y_IMAGE"] = x, y
+        columns["X_IMAGE"], columns["Y_IMAGE"] = x * units.pix, y * units.pix  # as SExtractor states it
         files.append(ldac(tmp_path / f"{name}.fits", columns, header))
     with pytest.raises(DataError, match="neither ALPHAWIN_J2000"):
         read_camera_catalogue(ascii_head(tmp_path / "x.cat", columns))
@@ -518,6 +518,34 @@ def test_units_of_fluxes_and_errors(tmp_path, units_of, gain, factor, message):
     np.testing.assert_allclose(read.flux, factor * columns["FLUX_AUTO"], rtol=1e-12)
     np.testing.assert_allclose(read.error, factor * columns["FLUXERR_AUTO"], rtol=1e-12)
     assert message is None or message in "; ".join(read.remarks)
+
+
+@pytest.mark.parametrize(
+    ("unit", "gain", "factor"),
+    [
+        ("", 2.0, 2.0),
+        ("kct", 2.0, 2e3),
+        ("ct / pixel", 2.0, 2.0),
+        ("electron", 2.0, None),
+        ("electron", None, None),
+    ],
+)
+def test_units_of_the_level_of_the_sky(tmp_path, unit, gain, factor):
+    """The level is in counts or in electrons as the fluxes are, in a unit of its own."""
+    columns = Table(of_camera(STARS, 0, np.random.default_rng(0)))
+    columns["BACKGROUND"] = np.full(len(columns), 40.0)
+    columns["BACKGROUND"].unit = unit or None
+    for name in ("FLUX_AUTO", "FLUXERR_AUTO"):
+        columns[name].unit = "ct"
+    columns.write(tmp_path / "a.ecsv")
+    if factor is None:
+        with pytest.raises(
+            DataError, match="BACKGROUND: is in electron, FLUX_AUTO in ct; give both in counts"
+        ):
+            read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)
+    else:
+        read = read_camera_catalogue(tmp_path / "a.ecsv", gain=gain)
+        np.testing.assert_allclose(read.sky, 40.0 * factor, rtol=1e-12)
 
 
 def test_rows_that_are_there_twice_are_one_star(tmp_path):

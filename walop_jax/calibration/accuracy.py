@@ -71,8 +71,8 @@ def judged(without_u: float) -> str:
     return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 
 
-def change_of_qu(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars polarised by up to `p`; NaN where not measured."""
+def change_of_qu(assumed: Matrices, true: Matrices) -> Float[np.ndarray, " p"]:
+    """Largest error of q and u at each field point for stars with p ≤ `LARGEST_P`; NaN where not measured."""
     errors = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
         return errors
@@ -80,11 +80,11 @@ def change_of_qu(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> Flo
     inverse = np.linalg.inv(assumed[good, :, 1:])
     change = (true - assumed)[good]
     offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
-    errors[good] = offset + p * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
+    errors[good] = offset + LARGEST_P * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
     return errors
 
 
-def largest_change(assumed: Matrices, true: Matrices, p: float = LARGEST_P) -> float:
+def largest_change(assumed: Matrices, true: Matrices) -> float:
     """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
-    errors = change_of_qu(assumed, true, p)
+    errors = change_of_qu(assumed, true)
     return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")

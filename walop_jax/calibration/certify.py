@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
+from walop_jax.calibration.product import validity
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
@@ -35,25 +35,6 @@ class Check(NamedTuple):
     name: str
     passed: bool
     found: str
-
-
-class Validity(NamedTuple):
-    """Range of application of a calibration: MJD of its exposures, their filters, their temperatures (Celsius)."""
-
-    mjd: tuple[float, float]
-    filters: tuple[str, ...]
-    temperature: tuple[float, float]
-
-
-def validity(product: Product) -> Validity:
-    """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
-    e = product.exposures
-    return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
-
-
-def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
-    finite = values[np.isfinite(values)]
-    return (float(finite.min()), float(finite.max())) if finite.size else (float("nan"), float("nan"))
 
 
 def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:

@@ -14,7 +14,6 @@ Limits      One mistake at a time; to first order in δθ.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -95,17 +94,12 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return ()
-    acting = acting_effects(calibration)
-    ahead = [  # of unmeasured mistakes alone
-        not measured and number in acting and is_ahead(calibration, acting[number])
-        for number, measured in enumerate(hidden.measured)
-    ]
-    columns = zip(
-        *(hidden.names, hidden.kinds, hidden.sizes, hidden.units, hidden.remedies, hidden.measured, ahead),
-        zip(np.median(errors, axis=1).tolist(), errors.max(axis=1).tolist(), strict=True),
-        strict=True,
-    )
-    mistakes = [mistake for mistake in itertools.starmap(CouldHide, columns) if mistake.error[1] > 0.0]
+    acting, mistakes = acting_effects(calibration), list[CouldHide]()
+    for number, (m, of_field) in enumerate(zip(hidden.mistakes, errors, strict=True)):
+        ahead = not m.measured and number in acting and is_ahead(calibration, acting[number])
+        error = float(np.median(of_field)), float(of_field.max())
+        if error[1] > 0.0:
+            mistakes.append(CouldHide(m.name, m.kind, m.size, m.unit, m.remedy, m.measured, ahead, error))
     return tuple(sorted(mistakes, key=lambda mistake: (-mistake.error[0], -mistake.error[1])))
 
 
@@ -144,8 +138,8 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     context = effect_context(model.template, calibration.exposures)
     names = {kind.name for kind in model.catalogue}
     effects = {}
-    for number, text in enumerate(() if hidden is None else hidden.acts):
-        values: dict[str, Any] = json.loads(text) if text else {}
+    for number, mistake in enumerate(() if hidden is None else hidden.mistakes):
+        values: dict[str, Any] = json.loads(mistake.acts) if mistake.acts else {}
         if (name := values.pop("effect", "")) in names:
             effects[number] = effect_by_name(name, model.catalogue).of(context, **values)
     return effects

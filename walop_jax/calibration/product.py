@@ -12,10 +12,11 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from astropy.io import fits
+from jaxtyping import Float
 
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
@@ -27,7 +28,7 @@ from walop_jax.data.kinds import CALIBRATION_PLATE, PREFIX
 from walop_jax.data.records import InputFile, Site, Sources
 from walop_jax.data.schema import Column, column_names, read_table, table_rules
 from walop_jax.data.units import Place
-from walop_jax.fit.verdict import DATA, STATED, Hidden, Structure, Verdict
+from walop_jax.fit.verdict import STATED, Hidden, Mistake, Structure, Verdict
 from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import PathLike, errors_naming, fail
@@ -62,16 +63,8 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
 """Tables and their columns, EXPOSURES apart, whose columns depend on the instrument."""
 
 _RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "chi2"}
-_MISTAKE: Mapping[str, tuple[str, Any]] = {
-    "HIDE": ("names", ""),
-    "SIZE": ("sizes", None),
-    "UNIT": ("units", ""),
-    "HKIND": ("kinds", DATA),
-    "CURE": ("remedies", ""),
-    "ACTS": ("acts", ""),
-    "SEEN": ("measured", True),
-}
-"""Numbered words of HIDDEN: the field of `Hidden` that each one is, and its value where it is absent."""
+_MISTAKE = dict(zip(Mistake._fields, ("HIDE", "SIZE", "UNIT", "HKIND", "CURE", "ACTS", "SEEN"), strict=True))
+"""Numbered words of HIDDEN by the field of `Mistake` that each one is."""
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
@@ -89,7 +82,24 @@ _WORDS = re.compile(
 _AGAIN = "make the product again"
 _NEWER = "use a newer walop-jax, or make the product again with this one"
 
-Cards = dict[str, tuple[Any, str]]
+
+class Validity(NamedTuple):
+    """Range of application of a calibration: MJD of its exposures, their filters, their temperatures (Celsius)."""
+
+    mjd: tuple[float, float]
+    filters: tuple[str, ...]
+    temperature: tuple[float, float]
+
+
+def validity(product: Product) -> Validity:
+    """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
+    e = product.exposures
+    return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
+
+
+def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (float("nan"), float("nan"))
 
 
 # ------------------------------------------------------------------------------------------------- writing
@@ -189,19 +199,19 @@ def _strings(values: Iterable[str]) -> np.ndarray:
 
 def _primary(c: Product) -> fits.PrimaryHDU:
     """The primary header: verdict, validity, software, content hash."""
-    verdict, site, structure = c.verdict, c.site, c.verdict.structure
+    verdict, structure, span = c.verdict, c.verdict.structure, validity(c)
     newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
     version = 1 if not newer and np.isin(c.exposures.kind, _FIRST_KINDS).all() else PRODVERS
-    cards: Cards = {
-        "TELESCOP": (site.telescope, ""),
+    cards: dict[str, tuple[Any, str]] = {
+        "TELESCOP": (c.site.telescope, ""),
         "INSTRUME": (c.instrument, ""),
         "PRODVERS": (version, "version of the calibration product format"),
         "ORIGIN": (c.origin, ""),
         "CREATOR": ("walop-jax", ""),
         "DATE": (c.date, "UTC, when the product was made"),
-        "SITELAT": (site.latitude, "[deg] latitude"),
-        "SITELONG": (site.longitude, "[deg] longitude, east positive"),
-        "SITEELEV": (site.elevation, "[m] elevation"),
+        "SITELAT": (c.site.latitude, "[deg] latitude"),
+        "SITELONG": (c.site.longitude, "[deg] longitude, east positive"),
+        "SITEELEV": (c.site.elevation, "[m] elevation"),
         "TRUSTED": (verdict.trusted, "converged and explains the data"),
         "CONVERGD": (verdict.converged, "the minimum was reached"),
         "CHI2": (verdict.chi2, "chi squared of data and priors"),
@@ -215,7 +225,11 @@ def _primary(c: Product) -> fits.PrimaryHDU:
         "STRUCTR": (structure.response if structure else np.nan, "rms response of a camera to q, u there"),
         "MAPFILT": (c.maps.filter, f"filter of the maps M21...{c.maps.names[-1]}"),
         **{n: (at, "[deg] extent of the field points used") for n, at in zip(_FIELD, c.field, strict=True)},
-        **_validity_cards(c),
+        "MJD-BEG": (span.mjd[0], "[d] UTC of the exposures"),
+        "MJD-END": (span.mjd[1], "[d] UTC of the exposures"),
+        "TEMPMIN": (span.temperature[0], "[Celsius] of the exposures"),
+        "TEMPMAX": (span.temperature[1], "[Celsius] of the exposures"),
+        **{f"FILTER{n}": (name, "") for n, name in enumerate(span.filters, start=1)},
         "HASHRULE": (HASHRULE, "what CONTHASH covers"),
         "CONTHASH": ("", ""),  # when all is there
     }
@@ -228,21 +242,6 @@ def _primary(c: Product) -> fits.PrimaryHDU:
     for number, (name, release) in enumerate(c.versions.items(), start=1):
         primary.header[f"SOFT{number}"] = in_ascii(f"{name} {release}")
     return primary
-
-
-def _validity_cards(c: Product) -> Cards:
-    """Dates, temperatures and filters that the product may be applied to, for a look: EXPOSURES has the same."""
-    cards: Cards = {}
-    for values, names, comment in (
-        (c.exposures.mjd, ("MJD-BEG", "MJD-END"), "[d] UTC of the exposures"),
-        (c.exposures.temp, ("TEMPMIN", "TEMPMAX"), "[Celsius] of the exposures"),
-    ):
-        finite = values[np.isfinite(values)]
-        if finite.size:
-            cards |= {names[0]: (float(finite.min()), comment), names[1]: (float(finite.max()), comment)}
-    for number, name in enumerate(np.unique(c.exposures.filter).tolist(), start=1):
-        cards[f"FILTER{number}"] = (name, "")
-    return cards
 
 
 def _map_hdu(name: str, image: np.ndarray, maps: MatrixMaps | ResidualMap) -> fits.ImageHDU:
@@ -270,11 +269,12 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
     """An image (mistake, parameter) of the shifts of the parameters by each mistake; no data where there is none."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number in range(len(hidden)):
-        for word, (attribute, usual) in _MISTAKE.items():
-            value = getattr(hidden, attribute)[number]
-            if word != "ACTS" or value != usual:
-                hdu.header[f"{word}{number + 1}"] = in_ascii(value) if isinstance(value, str) else value
+    for number, mistake in enumerate(hidden.mistakes, start=1):
+        for field, value in mistake._asdict().items():
+            if field != "acts" or value:
+                hdu.header[f"{_MISTAKE[field]}{number}"] = (
+                    in_ascii(value) if isinstance(value, str) else value
+                )
     return hdu
 
 
@@ -515,18 +515,16 @@ class _Reader:
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
-        columns: dict[str, list[Any]] = {attribute: [] for attribute, _ in _MISTAKE.values()}
-        while f"HIDE{(number := len(columns['names']) + 1)}" in header:
-            for word, (attribute, usual) in _MISTAKE.items():
-                name = f"{word}{number}"
-                value = _number(header, name, place) if usual is None else header.get(name, usual)
-                columns[attribute].append(str(value) if isinstance(usual, str) else value)
-        count = len(columns["names"])
-        changes = self.image("HIDDEN") if count else np.zeros((0, parameters))
-        if changes.shape != (count, parameters):
-            raise place.fail(f"has shape {changes.shape}, not {(count, parameters)}", advice=_AGAIN)
-        columns["measured"] = [value is not False for value in columns["measured"]]
-        return Hidden(changes=changes, **{name: tuple(values) for name, values in columns.items()})
+        mistakes, usual = list[Mistake](), {"unit": "", **Mistake._field_defaults}
+        while f"HIDE{(number := len(mistakes) + 1)}" in header:
+            words = {field: f"{word}{number}" for field, word in _MISTAKE.items()}
+            size, seen = _number(header, words.pop("size"), place), header.get(words.pop("measured"))
+            texts = {field: str(header.get(name, usual.get(field))) for field, name in words.items()}
+            mistakes.append(Mistake(size=size, measured=seen is not False, **texts))
+        changes = self.image("HIDDEN") if mistakes else np.zeros((0, parameters))
+        if changes.shape != (len(mistakes), parameters):
+            raise place.fail(f"has shape {changes.shape}, not {(len(mistakes), parameters)}", advice=_AGAIN)
+        return Hidden(tuple(mistakes), changes)
 
     def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
         """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""

@@ -22,11 +22,9 @@ def summary(
 ) -> dict[str, Any]:
     """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0."""
     verdict = result.checked_verdict()
-    mistakes, hidden = None, result.hidden
-    if hidden is not None:
-        columns = (hidden.names, hidden.sizes, hidden.units, hidden.kinds, hidden.measured)
-        keys = ("name", "size", "unit", "kind", "measured")
-        mistakes = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+    mistakes, keys = None, ("name", "size", "unit", "kind", "measured")
+    if result.hidden is not None:
+        mistakes = [{key: getattr(mistake, key) for key in keys} for mistake in result.hidden.mistakes]
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)

@@ -37,8 +37,7 @@ def certify(
     """
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.certify import certify as checks_of
-    from walop_jax.calibration.certify import validity
-    from walop_jax.calibration.product import product_path, read_calibration, read_product
+    from walop_jax.calibration.product import product_path, read_calibration, read_product, validity
     from walop_jax.science.commissioning import Certificate, requirements
     from walop_jax.science.field_accuracy import field_accuracy
 

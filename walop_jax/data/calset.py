@@ -291,10 +291,8 @@ def from_arrays(
     array([ 0., 30., 60., 90.])
     """
     check_units({"counts": unit_of(counts), "errors": unit_of(errors)}, "electron", Place(NAME, ""))
-    counts, errors = (
-        schema.in_unit(counts, "electron", "counts"),
-        schema.in_unit(errors, "electron", "errors"),
-    )
+    counts = schema.in_unit(counts, "electron", "counts")
+    errors = schema.in_unit(errors, "electron", "errors")
     x, y, angles = (
         np.atleast_1d(schema.in_unit(v, "deg", n)) for v, n in ((x, "x"), (y, "y"), (angles, "angles"))
     )

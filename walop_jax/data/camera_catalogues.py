@@ -56,6 +56,8 @@ _UNITS: Mapping[str, str] = {
     "electron": "electron", "electrons": "electron", "e-": "electron", "e": "electron",
 }  # fmt: skip
 """Units of fluxes by their names in catalogues."""
+_OF_A_PIXEL = re.compile(r"\s*/\s*pix(els?)?$")
+"""End of the unit of a level of the sky that is stated in a pixel: it is that of a level."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,8 +152,7 @@ def read_camera_catalogue(
     column_map = next((candidate for candidate in maps if _pair(source, candidate.flux)), None)
     if column_map is None:
         raise _no_flux(source, maps, place)
-    flux, error, factor = _fluxes(source, column_map, gain, place)
-    level = next((name.upper() for name in column_map.level if name.upper() in source.names), None)
+    flux, error, *sky = _fluxes(source, column_map, gain, place)
     ra, dec = _positions(source, column_map, header, place)
     flag = _flags(source, column_map, place)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
@@ -172,7 +173,7 @@ def read_camera_catalogue(
         flux=np.where(bad, np.nan, flux)[rows],
         error=np.where(bad, np.nan, error)[rows],
         flux_name=_pair(source, column_map.flux)[0],
-        sky=None if level is None else factor * _plain_numbers(source, level, place)[rows],
+        sky=sky[0][rows] if sky else None,
         flag=np.where(bad, flag | BAD_PIXEL, flag)[rows],
         of_stars={name: values[rows] for name, values in of_stars.items()},
         of_exposure={name: value for name, value in of_exposure.items() if value is not None},
@@ -246,19 +247,21 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
-) -> tuple[Numbers, Numbers, float]:
-    """Fluxes and errors (electrons), and electrons per count; an error without a unit has that of its flux."""
-    names = _pair(source, column_map.flux)
-    unused = [pair[0] for pair in column_map.flux if pair != names and pair[0].upper() in source.names]
-    stated = [unit_of(_one(source, name, place)).strip() for name in names]
+) -> tuple[Numbers, ...]:
+    """Fluxes, errors and the level of the sky, if there is one (electrons); without a unit they have the flux's."""
+    pair = _pair(source, column_map.flux)
+    unused = [other[0] for other in column_map.flux if other != pair and other[0].upper() in source.names]
+    names = [*pair, *[name for name in column_map.level if name.upper() in source.names][:1]]
+    stated = [_OF_A_PIXEL.sub("", unit_of(_one(source, name, place)).strip()) for name in names]
     given = [unit or next(filter(None, stated), column_map.unit) for unit in stated]
     plain = [_UNITS.get(unit.lower(), unit) for unit in given]
-    counts, of_error = (unit != "electron" for unit in plain)
-    if counts != of_error:
-        what = f"is in {given[1]}, {names[0]} in {given[0]}"
-        raise place.fail(what, _plain(names[1])[0], "give both in counts, or both in electrons")
+    counts = plain[0] != "electron"
+    for name, unit in zip(names[1:], plain[1:], strict=True):
+        if (unit != "electron") != counts:
+            what = f"is in {given[names.index(name)]}, {names[0]} in {given[0]}"
+            raise place.fail(what, _plain(name)[0], "give both in counts, or both in electrons")
     wanted = "ct" if counts else "electron"
-    flux, error = (
+    flux, error, *sky = (
         convert_unit(_plain_numbers(source, name, place), unit, wanted, _plain(name)[0], place)
         for name, unit in zip(names, plain, strict=True)
     )
@@ -279,7 +282,7 @@ def _fluxes(
     if unused:
         source.remarks.append(f"fluxes are {names[0]}, not {some(unused, 3)}")
     factor = gain if counts and gain is not None else 1.0
-    return factor * flux, factor * error, factor
+    return tuple(factor * values for values in (flux, error, *sky))
 
 
 def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
@@ -303,7 +306,7 @@ def _positions(
         ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
     elif pixels and "CRVAL1" in header:
         plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
-        x, y = (numeric_column(source, _plain(name)[0], Column("float", missing=np.nan)) for name in pixels)
+        x, y = (_plain_numbers(source, name, place) for name in pixels)
         ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
         ra, dec = np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
     else:

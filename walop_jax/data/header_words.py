@@ -95,9 +95,8 @@ def words_of(content: Mapping[str, Any]) -> Words:
             table = {**table, "word": (single,)}
         columns[name] = word = Word(**read.values(of_word, table, name))
         if bool(word.word) == ("value" in table):
-            raise read.fault(
-                name, 'needs word = "…", a list of words of which the first is taken, or value = …'
-            )
+            what = 'needs word = "…", a list of words of which the first is taken, or value = …'
+            raise read.fault(name, what)
         if word.expression and (odd := _names(word.expression, read, name) - {"x", *content}):
             raise read.fault(name, f"expression: there is no {min(odd)!r}; {nearest(min(odd), content)}")
     top = read.values(tops, {key: value for key, value in content.items() if key in tops}, "")
@@ -318,9 +317,8 @@ def _number(value: Any, name: str, rule: Column, word: Word, place: Place, what:
         if with_unit:
             return value / 15.0 if rule.unit == "h" else value
         if not word.unit:
-            raise place.fail(
-                f"{what} may be hours or degrees", name, 'give unit = "hourangle" or unit = "deg"'
-            )
+            advice = 'give unit = "hourangle" or unit = "deg"'
+            raise place.fail(f"{what} may be hours or degrees", name, advice)
     if isinstance(value, bool) or not _is_number(value):
         raise place.fail(f"{what} is not a number", name, "give another word, or values = { … }")
     numbers = np.array([float(value)])
@@ -347,9 +345,8 @@ def _names(expression: str, read: Reader, name: str) -> set[str]:
     for node in ast.walk(tree):
         number = not isinstance(node, ast.Constant) or type(node.value) in (int, float)
         if not isinstance(node, allowed) or not number:
-            raise read.fault(
-                name, f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
-            )
+            what = f"expression = {expression!r} may hold numbers, columns, + - * / % ** and ( ) only"
+            raise read.fault(name, what)
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 

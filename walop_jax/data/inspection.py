@@ -115,14 +115,13 @@ class Inspection(Displayed):
         sampled_points = f" at {self.looked_at} points looked at" if self.looked_at < self.points else ""
         place = ", ".join(filter(None, (self.instrument, self.telescope)))
         noise = f"{self.noise_ratio**0.5:.4g} × the photon noise √N (median)"
-        counts = {use.prefix: (use.exposures, len(use.angles)) for use in self.elements}
-        uses = {f"element {p}": f"in {n} exposures, {angles} angles" for p, (n, angles) in counts.items()}
+        number = {use.prefix: f"{use.exposures} exposures, {len(use.angles)} angles" for use in self.elements}
         facts = {
             "instrument": f"{place} ({self.origin or 'origin not stated'})",
             "field points": f"{self.points}, X {low_x:+.3f} … {high_x:+.3f}°, Y {low_y:+.3f} … {high_y:+.3f}°",
             "cameras": str(self.cameras),
             "polariser angles": f"{len(self.angles)} modulo 180°, widest gap {self.widest_gap:.3g}°",
-            **uses,
+            **{f"element {prefix}": f"in {uses}" for prefix, uses in number.items()},
             "used": f"{self.rows} of {self.possible} (exposure, point) pairs{sampled_points}{apart}",
             "flagged": ", ".join(f"{count} {name}" for name, count in self.flags.items()) or "none",
             "median counts": f"{rounded(self.median_counts)} electrons" if counted else "none: all KIND flux",
@@ -204,8 +203,7 @@ def inspect(calset: CalibrationSet) -> Inspection:
     counts, sigma = block.counts[measured], block.sigma[measured]
     ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
     by_camera = np.array([_median(of_camera) for of_camera in ratio.T])
-    angles = np.unique(np.round(np.mod(e.clp_angle[e.clp_in & live], 180.0), 3))
-    gaps = np.diff(np.append(angles, angles[:1] + 180.0))
+    angles = _distinct(np.mod(e.clp_angle[e.clp_in & live], 180.0))
     inspection = Inspection(
         instrument=calset.instrument,
         telescope=calset.site.telescope,
@@ -216,12 +214,10 @@ def inspect(calset: CalibrationSet) -> Inspection:
         groups=_groups(calset, share),
         points=len(points),
         field=(float(points.x.min()), float(points.x.max()), float(points.y.min()), float(points.y.max())),
-        angles=tuple(angles.tolist()),
-        widest_gap=float(gaps.max(initial=0.0)) if len(angles) > 1 else 180.0,
+        angles=angles,
+        widest_gap=_widest_gap(np.array(angles), 180.0),
         elements=tuple(
-            ElementUse(
-                prefix, int(at.inside.sum()), tuple(np.unique(np.round(at.angle[at.inside], 3)).tolist())
-            )
+            ElementUse(prefix, int(at.inside.sum()), _distinct(at.angle[at.inside]))
             for prefix, at in e[live].further.items()
         ),
         looked_at=len(used),
@@ -239,6 +235,17 @@ def inspect(calset: CalibrationSet) -> Inspection:
     return dataclasses.replace(inspection, findings=(*findings, *notes))
 
 
+def _distinct(angles: np.ndarray) -> tuple[float, ...]:
+    """Different angles (deg), in ascending order."""
+    return tuple(np.unique(np.round(angles, 3)).tolist())
+
+
+def _widest_gap(angles: np.ndarray, turn: float) -> float:
+    """The largest distance between neighbours among angles (deg) that are the same again after a `turn`."""
+    ordered = np.sort(np.mod(angles, turn))
+    return float(np.diff(np.append(ordered, ordered[:1] + turn)).max(initial=0.0)) if len(ordered) else turn
+
+
 def _median(values: np.ndarray) -> float:
     """The median of the finite ones, NaN of none."""
     finite = values[np.isfinite(values)]
@@ -254,7 +261,7 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
     groups = []
     for key in dict.fromkeys(keys):
         rows = np.array([n for n, group in enumerate(keys) if group == key])
-        angles = np.unique(np.round(e.clp_angle[rows][e.clp_in[rows]], 3))
+        angles = _distinct(e.clp_angle[rows][e.clp_in[rows]])
         groups.append(Group(*key, len(rows), len(angles), float(share[rows].mean())))
     return tuple(groups)
 
@@ -315,7 +322,7 @@ def _about_angles(made: Inspection) -> Iterator[Finding]:
 def about_exposures(exposures: Exposures) -> Iterator[Finding]:
     """Notes on what exposures, taken or planned, cannot show whatever their counts are."""
     e = exposures
-    if e.clp_in.any() and not e.further and np.ptp(np.mod(e.clp_angle[e.clp_in], 360.0)) < 180.0:
+    if e.clp_in.any() and not e.further and _widest_gap(e.clp_angle[e.clp_in], 360.0) > 180.0:
         advice = "a full turn is needed to separate an encoder wobble from the instrument"
         yield Finding("note", "the polariser turns through half a turn only", advice)
     if not np.any(e.direct("moon", "standard")):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER, PREFIX
 from walop_jax.data.records import DataFlag
-from walop_jax.data.units import Place, check_partners, convert_unit, differs, unit_of
+from walop_jax.data.units import Place, check_units, convert_unit, differs, partner_of, unit_of
 from walop_jax.io.errors import nearest, rows_text
 
 Kind = Literal["int", "float", "bool", "str"]
@@ -295,8 +295,10 @@ def _filled(
         else np.full(rows, column.missing)
         for name, column in columns.items()
     }
-    numbers = {name: column.unit for name, column in columns.items() if column.kind == "float"}
-    check_partners(units_of, numbers, place)
+    for name, unit in units_of.items():
+        partner, column = partner_of(name), columns[name]
+        if partner != name and partner in units_of and column.kind == "float":
+            check_units({partner: units_of[partner], name: unit}, column.unit, place)
     return table
 
 

@@ -91,14 +91,6 @@ def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
         raise place.fail(what, without[0], f"give all in one unit, or all in {wanted or 'fractions'}")
 
 
-def check_partners(given: Mapping[str, str], wanted: Mapping[str, str], place: Place) -> None:
-    """`check_units` of every column with its partner; `wanted` are the units of the columns that are numbers."""
-    for name, unit in given.items():
-        partner = partner_of(name)
-        if partner != name and partner in given and name in wanted:
-            check_units({partner: given[partner], name: unit}, wanted[name], place)
-
-
 def differs(unit: str, wanted: str) -> bool:
     """True where a unit is to be converted."""
     try:

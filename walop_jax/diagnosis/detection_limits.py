@@ -449,7 +449,7 @@ def _collected(
     hidden = hidden_errors(calibration, points.x, points.y, setting)
     assert calibration.hidden is not None
     all_errors = np.vstack([SECOND_ORDER * errors, hidden, np.full((1, len(points)), np.nan)])
-    names_of = (*(c.probe.effect.name for c in columns), *calibration.hidden.names, "")
+    names_of = (*(c.probe.effect.name for c in columns), *(m.name for m in calibration.hidden.mistakes), "")
     worst = np.where(np.isfinite(all_errors), all_errors, -1.0)
     largest = worst.argmax(axis=0)
     protection = worst[largest, np.arange(len(points))]

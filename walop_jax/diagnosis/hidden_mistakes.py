@@ -30,7 +30,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles
-from walop_jax.fit.verdict import DATA, EFFECT, Hidden
+from walop_jax.fit.verdict import DATA, EFFECT, Hidden, Mistake
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
@@ -87,20 +87,12 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     further = [i for i, *_ in best.values() if i not in always][:MOST_HIDDEN]
     order = sorted([*always, *further], key=lambda i: -errors[i])
     acting = {i for i, acts, elsewhere in best.values() if acts or elsewhere}
-    selected = [mistakes[i] for i in order]
-    texts = (
-        as_text(m.effect) if (m := mistakes[i]).effect is not None and i in acting else "" for i in order
-    )
-    return Hidden(
-        names=tuple(m.name for m in selected),
-        sizes=tuple(m.size for m in selected),
-        units=tuple(m.unit for m in selected),
-        changes=changes[order],
-        kinds=tuple(m.kind for m in selected),
-        remedies=tuple(m.shown_by for m in selected),
-        acts=tuple(texts),
-        measured=tuple(i not in unseen for i in order),
-    )
+    hidden = []
+    for i in order:
+        m = mistakes[i]
+        acts = as_text(m.effect) if m.effect is not None and i in acting else ""
+        hidden.append(Mistake(m.name, m.size, m.unit, m.kind, m.shown_by, acts, i not in unseen))
+    return Hidden(tuple(hidden), changes[order])
 
 
 def _mistakes(singles: Singles, of_stars: _Starlight) -> Iterator[_Mistake]:

@@ -6,8 +6,8 @@ import dataclasses
 import enum
 import functools
 import operator
-from collections.abc import Iterator, Sequence
-from typing import Any, Self
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -102,51 +102,50 @@ EFFECT, DATA = "effect", "data"
 """Kinds of mistakes that could hide: of the model of the instrument, of numbers that the set states."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Hidden:
-    """Single mistakes that the data would not show, by name.
+class Mistake(NamedTuple):
+    """A mistake that the data would not show.
 
-    `sizes` in `units` are those that would just have been found, or the largest plausible ones; `changes` what each
-    does to the parameters of the model, all of them in tree order. The largest effect of any of them on a star is the
-    protection level of its Stokes parameters (RAIM: National Academies 4920, 2023). `kinds` are `EFFECT` or `DATA`,
-    `remedies` measurements that would show them. What acts on starlight itself is an effect that the model has not:
-    `acts` holds it at its size, as JSON of name and values, "" for all others. It is not `measured` where the data hold
-    no information on it at all.
+    Its `size` in `unit` would just have been found, or is the largest plausible one. `kind` is `EFFECT` or `DATA`,
+    `remedy` a measurement that would show it. What acts on starlight itself is an effect that the model has not: `acts`
+    holds it at its size, as JSON of name and values, "" for all others. It is not `measured` where the data hold no
+    information on it at all.
     """
 
-    names: tuple[str, ...]
-    sizes: tuple[float, ...]
-    units: tuple[str, ...]
-    changes: Float[np.ndarray, "s n"]
-    kinds: tuple[str, ...] = ()
-    remedies: tuple[str, ...] = ()
-    acts: tuple[str, ...] = ()
-    measured: tuple[bool, ...] = ()
+    name: str
+    size: float
+    unit: str
+    kind: str = DATA
+    remedy: str = ""
+    acts: str = ""
+    measured: bool = True
 
-    def __post_init__(self) -> None:
-        for name, usual in (("kinds", DATA), ("remedies", ""), ("acts", ""), ("measured", True)):
-            if not getattr(self, name):
-                object.__setattr__(self, name, (usual,) * len(self.names))
+
+@dataclasses.dataclass(frozen=True)
+class Hidden:
+    """Single mistakes that the data would not show.
+
+    `changes` are what each does to the parameters of the model, all of them in tree order. The largest effect of any of
+    them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
+    """
+
+    mistakes: tuple[Mistake, ...]
+    changes: Float[np.ndarray, "s n"]
 
     def __len__(self) -> int:
-        return len(self.names)
-
-    def each(self) -> Iterator[tuple[str, float, str]]:
-        """Name, size and unit of each."""
-        return zip(self.names, self.sizes, self.units, strict=True)
+        return len(self.mistakes)
 
     def not_measured(self) -> tuple[str, ...]:
         """Names of all unmeasured mistakes, each with the measurement to take."""
         together: dict[str, list[str]] = {}
-        for name, remedy, measured in zip(self.names, self.remedies, self.measured, strict=True):
-            if not measured:
-                together.setdefault(remedy, []).append(name)
+        for mistake in self.mistakes:
+            if not mistake.measured:
+                together.setdefault(mistake.remedy, []).append(mistake.name)
         joined = {", ".join(names): remedy for remedy, names in together.items()}
         return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
-        sizes = [f"{name} of {rounded(size, '.2g')} {unit}".rstrip() for name, size, unit in self.each()]
+        sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.mistakes]
         return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
 

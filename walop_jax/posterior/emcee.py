@@ -56,7 +56,7 @@ class Emcee(Sampler):
         value = density.log_density(positions)
         if not np.all(np.isfinite(value)):
             raise ValueError("the posterior is not finite around the fit")
-        return emcee_state(positions, value, random.get_state(legacy=True))
+        return {"positions": positions, "log_density": value, "random": random.get_state(legacy=True)}
 
     def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
         """Go on for that many steps of all walkers."""
@@ -65,29 +65,15 @@ class Emcee(Sampler):
         count, dimension = state["positions"].shape
         how = {"vectorize": True, "moves": mixture(self.moves)}
         sampler = emcee.EnsembleSampler(count, dimension, density.log_density, **how)
-        random = tuple(random_attributes(state).values())
-        current = emcee.State(state["positions"], log_prob=state["log_density"], random_state=random)
+        current = emcee.State(state["positions"], log_prob=state["log_density"], random_state=state["random"])
         positions, value = np.empty((steps, count, dimension)), np.empty((steps, count))
         accepted = np.zeros((steps + 1, count))
         run = sampler.sample(current, iterations=steps, store=True, skip_initial_state_check=True)
         for i, current in enumerate(run):
             positions[i], value[i] = current.coords, current.log_prob
             accepted[i + 1] = sampler.backend.accepted
-        last = emcee_state(positions[-1].copy(), value[-1].copy(), sampler.random_state)
-        return last, Stretch(positions, value, np.diff(accepted, axis=0))
-
-
-def emcee_state(positions: Float[np.ndarray, "w k"], value: Float[np.ndarray, " w"], random: Any) -> State:
-    """The state of an ensemble; `random` is that of a Mersenne twister."""
-    numbers = {"random_keys": random[1], "random_rest": np.array(random[2:], float)}
-    return {"positions": positions, "log_density": value, **numbers}
-
-
-def random_attributes(state: State) -> dict[str, Any]:
-    """The random numbers of a state as emcee's back end keeps them."""
-    numbers = state["random_rest"]
-    attributes = ("MT19937", state["random_keys"], int(numbers[0]), int(numbers[1]), float(numbers[2]))
-    return {f"random_state_{number}": attribute for number, attribute in enumerate(attributes)}
+        last = {"positions": positions[-1].copy(), "log_density": value[-1].copy()}
+        return last | {"random": sampler.random_state}, Stretch(positions, value, np.diff(accepted, axis=0))
 
 
 def _laplace_draws(

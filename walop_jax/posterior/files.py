@@ -20,7 +20,6 @@ import numpy as np
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
-from walop_jax.posterior.emcee import emcee_state, random_attributes
 from walop_jax.posterior.result import PosteriorSample
 from walop_jax.posterior.samplers import State, Stretch
 
@@ -74,7 +73,8 @@ class Chain:
                 steps, walkers, dimension = stretch.positions.shape
                 group = file.create_group(f"ensemble{number}")
                 size = {"nwalkers": walkers, "ndim": dimension, "iteration": steps}
-                group.attrs.update({"version": "3", "has_blobs": False, **size, **random_attributes(state)})
+                random = {f"random_state_{k}": number for k, number in enumerate(state["random"])}
+                group.attrs.update({"version": "3", "has_blobs": False, **size, **random})
                 group["chain"], group["log_prob"] = stretch.positions, stretch.log_density
                 group["accepted"] = stretch.acceptance.sum(axis=0)
 
@@ -93,8 +93,14 @@ class Chain:
             # Of the proposals accepted the file has the mean of each walker.
             shares = (np.repeat(k.accepted[None] / k.iteration, k.iteration, axis=0) for k in arrays)
             stretches = [Stretch(k.get_chain(), k.get_log_prob(), next(shares)) for k in arrays]
-            ends = ((s.positions[-1], s.log_density[-1]) for s in stretches)
-            states = [emcee_state(*end, k.random_state) for end, k in zip(ends, arrays, strict=True)]
+            states: list[State] = [
+                {
+                    "positions": s.positions[-1],
+                    "log_density": s.log_density[-1],
+                    "random": tuple(k.random_state),
+                }
+                for s, k in zip(stretches, arrays, strict=True)
+            ]
         except Exception as error:  # whatever a damaged file brings about
             raise fail(f"cannot be read: {error}", file=self.path, advice=_ADVICE) from error
         keys = sorted({*before, *self.fingerprint})

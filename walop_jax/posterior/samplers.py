@@ -29,7 +29,7 @@ SAMPLERS = {"emcee": "walop_jax.posterior.emcee:Emcee", "nuts": "walop_jax.poste
 Positions = Float[np.ndarray, "n k"]
 Batch = Callable[[Positions], Float[np.ndarray, " n"]]
 
-State = Mapping[str, np.ndarray]  # all there is to an ensemble between two steps, as named arrays
+State = Mapping[str, Any]  # all there is to an ensemble between two steps, by name
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from walop_jax.calibration.certify import Check, Validity
-from walop_jax.calibration.product import PRODVERS
+from walop_jax.calibration.certify import Check
+from walop_jax.calibration.product import PRODVERS, Validity
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.verdict import Verdict

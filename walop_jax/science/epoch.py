@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -224,8 +224,7 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     covariance = before + after - product - product.T
     sigma = np.sqrt(np.diag(before + after))
     units = [model[name].unit for name in names]
-    measured = MeasuredChange.of(names, change, covariance, sigma, units)
-    largest = measured.largest()
+    chi2, directions, largest = compared(names, change, covariance, sigma, units)
     values = new.values.copy()
     values[b] = was
     fitted = [model.index(name) for name in result.model.names]
@@ -235,13 +234,15 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         for n, unit, w, j, d, s in zip(names, units, was, b, change, error, strict=True)
         if s > 0
     ]
-    p_value = _of_several(min(float(special.chdtrc(measured.directions, measured.chi2)), largest.p_value), 2)
+    p_value = _of_several(min(float(special.chdtrc(directions, chi2)), largest.p_value), 2)
     of_all = np.zeros_like(new.covariance)
     of_all[np.ix_(b, b)] = covariance
     doubts = ["these are the data from which the old calibration was made: nothing can have moved"] * same
-    if not same and special.chdtr(measured.directions, measured.chi2) < COPIES:
-        chi2 = f"χ² = {measured.chi2:.2g} in {measured.directions} directions"
-        doubts = [f"the two data sets agree too well to be independent ({chi2}): is one a copy of the other?"]
+    if not same and special.chdtr(directions, chi2) < COPIES:
+        what = (
+            f"the two data sets agree too well to be independent (χ² = {chi2:.2g} in {directions} directions)"
+        )
+        doubts = [f"{what}: is one a copy of the other?"]
     return Epoch(
         fits=p_value > CHANCE,
         new_trusted=result.trusted,
@@ -249,8 +250,8 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
         added=added,
         same=same,
         p_value=p_value,
-        test=measured.chi2,
-        directions=measured.directions,
+        test=chi2,
+        directions=directions,
         largest=largest,
         visible=_visible(dataclasses.replace(new, covariance=of_all)),
         chi2_old=result.likelihood.expand(values[fitted], near=result.expansion).chi2,
@@ -287,62 +288,31 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
     return [p.name for p in free if p.part in effects and leaf[p.name] not in shapes.get(p.part, ())]
 
 
-class MeasuredChange(NamedTuple):
-    """A change in units of `sigma`, for parameters known at all, and V⁻¹ over the measured `directions`, a number."""
+def compared(
+    names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector, units: Sequence[str]
+) -> tuple[float, int, LargestChange]:
+    """Δᵀ V⁻¹ Δ, the number of directions that were measured, and the largest change of a single parameter.
 
-    names: tuple[str, ...]
-    change: Float[np.ndarray, " k"]
-    covariance: Float[np.ndarray, "k k"]
-    inverse: Float[np.ndarray, "k k"]
-    directions: int
-    sigma: Float[np.ndarray, " k"]
-    units: tuple[str, ...]
-
-    @classmethod
-    def of(
-        cls,
-        names: Sequence[str],
-        change: Vector,
-        covariance: Matrix,
-        sigma: Vector,
-        units: Sequence[str] = (),
-    ) -> MeasuredChange:
-        """The change of parameters, each in units of its `sigma`; those with none are not known."""
-        measured = np.flatnonzero(sigma > 0)
-        unit = sigma[measured]
-        scaled = covariance[np.ix_(measured, measured)] / np.outer(unit, unit)
-        value, vector = np.linalg.eigh(scaled)
-        good = value > _KNOWN * value[-1]
-        inverse = (vector[:, good] / value[good]) @ vector[:, good].T
-        return cls(
-            tuple(names[k] for k in measured.tolist()),
-            change[measured] / unit,
-            scaled,
-            inverse,
-            int(good.sum()),
-            unit,
-            tuple(units[k] for k in measured.tolist()) if units else ("",) * len(measured),
-        )
-
-    @property
-    def chi2(self) -> float:
-        """Δᵀ V⁻¹ Δ over the directions that were measured."""
-        return float(self.change @ self.inverse @ self.change)
-
-    def largest(self) -> LargestChange:
-        """The largest of the changes of single parameters, each by itself and as if nothing else had changed."""
-        variances, alone = np.diag(self.covariance), np.diag(self.inverse)
-        widths = np.where(variances > _LEANS, variances, np.inf), np.where(alone > 0, alone, np.inf)
-        width = np.sqrt(np.stack(widths))
-        z = np.stack([self.change, self.inverse @ self.change]) / width
-        way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
-        questions = int(np.isfinite(width).sum())
-        p = float(special.chdtrc(1, z[way, i] ** 2))
-        # Of one alone: a/√(V⁻¹)_ii, with the error 1/√(V⁻¹)_ii.
-        error = self.sigma[i] * (width[0, i] if way == 0 else 1.0 / width[1, i])
-        name, unit, size = self.names[int(i)], self.units[int(i)], float(z[way, i] * error)
-        judged = float(z[way, i]), bool(way), questions, _of_several(p, questions)
-        return LargestChange(name, size, float(error), unit, *judged)
+    Every parameter counts by itself and as if nothing else had changed; those of `sigma` 0 are not known.
+    """
+    measured = np.flatnonzero(sigma > 0)
+    unit = sigma[measured]
+    change, scaled = change[measured] / unit, covariance[np.ix_(measured, measured)] / np.outer(unit, unit)
+    value, vector = np.linalg.eigh(scaled)
+    good = value > _KNOWN * value[-1]
+    inverse = (vector[:, good] / value[good]) @ vector[:, good].T
+    variances, alone = np.diag(scaled), np.diag(inverse)
+    widths = np.where(variances > _LEANS, variances, np.inf), np.where(alone > 0, alone, np.inf)
+    width = np.sqrt(np.stack(widths))
+    z = np.stack([change, inverse @ change]) / width
+    way, i = np.unravel_index(np.abs(z).argmax(), z.shape)
+    questions = int(np.isfinite(width).sum())
+    p = _of_several(float(special.chdtrc(1, z[way, i] ** 2)), questions)
+    # Of one alone: a/√(V⁻¹)_ii, with the error 1/√(V⁻¹)_ii.
+    error = float(unit[i] * (width[0, i] if way == 0 else 1.0 / width[1, i]))
+    at, size = int(measured[i]), float(z[way, i] * error)
+    largest = LargestChange(names[at], size, error, units[at], float(z[way, i]), bool(way), questions, p)
+    return float(change @ inverse @ change), int(good.sum()), largest
 
 
 def _visible(changed: Calibration) -> dict[str, float]:

@@ -89,7 +89,7 @@ class StarResiduals:
         values = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         first = np.cumsum([0, *(len(p.photon) for p in parts[:-1])])
         star = np.concatenate([p.star + start for p, start in zip(parts, first, strict=True)])
-        return cls(star=star, together=parts[0].together, structure=parts[0].structure, **values)
+        return dataclasses.replace(parts[0], star=star, **values)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -123,7 +123,7 @@ class StarResiduals:
         rows = slice(first[start], first[stop])
         cut = {name: values[rows] for name, values in vars(self).items() if name not in _OF_ALL}
         cut |= {"star": self.star[rows] - start, "photon": self.photon[stars]}
-        return StarResiduals(together=self.together, **cut)
+        return dataclasses.replace(self, **cut)
 
     def blocks(self) -> Iterator[tuple[slice, slice, StarResiduals]]:
         """Slices of stars and of rows, some `CHECKED_ROWS` of these, each with its part."""
