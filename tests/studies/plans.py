@@ -30,11 +30,13 @@ import jax
 import numpy as np
 from scipy.optimize import linprog
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from changed_sets import block_of, with_block  # noqa: E402
 
 import walop_jax as walop  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis import thresholds  # noqa: E402
 from walop_jax.diagnosis.exact import try_effect  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
@@ -122,11 +124,10 @@ def scattered(calset: CalibrationSet, floor: float, seed: int) -> CalibrationSet
     """A set that scatters as a fit takes it to, where errors have a floor: what the model lacks is no photon noise."""
     if floor == 0.0:
         return calset
-    block = calset.intensities.block(0, len(calset.points))
+    block = block_of(calset)
     more = np.sqrt(with_floor(block.sigma, block.counts, floor) ** 2 - block.sigma**2)
     counts = block.counts + more * np.random.default_rng([seed, 1]).normal(size=block.counts.shape)
-    block = dataclasses.replace(block, counts=counts)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+    return with_block(calset, counts=counts)
 
 
 def errors() -> None:
