@@ -15,7 +15,6 @@ how many of these are better and worse *with* it: right or in its class before o
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import sys
 from collections import Counter
@@ -33,6 +32,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 from blind import Scene  # noqa: E402
 from generate import STEP, Layout  # noqa: E402
 from judge import opened  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.diagnosis import examination, search, thresholds  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
@@ -206,11 +206,9 @@ def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options_of(__doc__, each=1, quiet=40, pairs=40)
     parser.add_argument("old", type=Path)
     parser.add_argument("new", type=Path)
-    for name, count in {"each": 1, "quiet": 40, "pairs": 40}.items():
-        parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--seed", type=int, default=2, help="of NEW")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

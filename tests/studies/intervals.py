@@ -15,7 +15,6 @@ non-linearity     coefficients of all cameras fitted; stars of a tenth and of th
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from changed_sets import block_of, with_block  # noqa: E402
 from frame_run import frame_run  # noqa: E402
 from frames_file import write_frames  # noqa: E402
 from small_run import SMALL  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
@@ -193,12 +193,7 @@ def share(runs: list[np.ndarray], within: float) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=int, default=60)
-    parser.add_argument("--frames", type=int, default=12)
-    options = parser.parse_args()
+    options = options_of(__doc__, runs=60, frames=12).parse_args()
     jax.config.update("jax_enable_x64", True)
     for name, study, runs in (
         ("no TEFF", colours, options.runs),

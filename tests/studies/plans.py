@@ -17,7 +17,6 @@ diagnosed a run from end to end: a set is diagnosed, the exposures that tell apa
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import json
@@ -34,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from changed_sets import block_of, with_block  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 import walop_jax as walop  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
@@ -480,9 +480,7 @@ def diagnosed() -> None:
 
 def main() -> None:
     """Print the study."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parts = {"errors": errors, "built": built, "beside": beside, "naming": naming, "diagnosed": diagnosed}
     parser.add_argument("parts", nargs="*", default=list(parts), choices=list(parts))
     for part in parser.parse_args().parts:

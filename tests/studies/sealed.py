@@ -56,6 +56,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from oracle import forward  # noqa: E402
 from studies.sealed_judging import FEW, TEFF, Judged, homes_of, judged, right_of  # noqa: E402
 from studies.sealed_optics import Hidden, vectors  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
@@ -544,12 +545,7 @@ def table(outcomes: list[Outcome]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=400)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=53)
-    parser.add_argument("--side", type=int, default=8)
-    parser.add_argument("--minutes", type=float, default=3.0)
+    parser = options_of(__doc__, sets=400, first=0, seed=53, side=8, minutes=3.0)
     parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
     parser.add_argument("--save", type=Path, help="file of the outcomes so far, written after every set")

@@ -15,7 +15,6 @@ wrong.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import sys
@@ -33,6 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from changed_sets import block_of, with_block  # noqa: E402
 from small_run import SMALL  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
@@ -288,11 +288,7 @@ def judged(number: int, seed: int) -> Judged:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=600)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=77)
-    options = parser.parse_args()
+    options = options_of(__doc__, sets=600, first=0, seed=77).parse_args()
     jax.config.update("jax_enable_x64", True)
     found: Counter[tuple[str, str]] = Counter()
     for number in range(options.first, options.first + options.sets):
