@@ -5,22 +5,15 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-import numpy as np
-from small_run import SMALL
+from fits_with import examined_with, fit_with, set_with
 
-from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_product import only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
-from walop_jax.diagnosis.examination import Examination, examine
+from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Diagnosis, Step
-from walop_jax.diagnosis.hypotheses import Hypotheses
-from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import FitResult, fit
+from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Quality
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
-from walop_jax.model.specification import effect_context, with_effects
-from walop_jax.simulation.simulate import simulate
 
 TOLD = "gain of O1 * kind moon"
 
@@ -28,16 +21,8 @@ TOLD = "gain of O1 * kind moon"
 @functools.cache
 def examined() -> Examination:
     """A camera is brighter on the Moon by 0.3 %: the fit of that description, its gains asked."""
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([TOLD], [3e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([TOLD], [0.0])], context)
-    result = fit(Likelihood.of(calset, model))
-    said = [
-        probe
-        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
-        if probe.name.startswith("gain of")
-    ]
-    return examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
+    result = fit_with(set_with(3, {TOLD: 3e-3}), TOLD)
+    return examined_with(result, lambda name: name.startswith("gain of"))
 
 
 @functools.cache

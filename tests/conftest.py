@@ -49,7 +49,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile quickly and little unless something is timed, and keep compiled code in pytest's own cache.
 
-    Workers and processes of tests share the cache, and so does the next run.
+    Workers and processes of tests share the cache, and so does the next run. Where Python is not to write bytecode
+    beside the sources, it is there too: to compile tests and modules is more than half of the time of collecting them.
     """
     if not config.getoption("--benchmark"):
         flags = (
@@ -64,6 +65,10 @@ def pytest_configure(config: pytest.Config) -> None:
     cache = getattr(config, "cache", None)
     if cache is None:
         return
+    if sys.dont_write_bytecode:
+        sys.dont_write_bytecode, sys.pycache_prefix = False, str(cache.mkdir("bytecode"))
+        os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     folder = str(cache.mkdir("xla"))
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILED)

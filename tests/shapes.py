@@ -29,7 +29,8 @@ def check_package() -> None:
 def checked(function: Any) -> Any:
     """A function whose arguments and result are checked, equal names of axes together; a dataclass made by such.
 
-    What `jaxtyping.jaxtyped` does with `beartype`, in a third of its time: arguments are bound and checked once.
+    What `jaxtyping.jaxtyped` does with `beartype`, in a third of its time: arguments are bound and checked once. The
+    check is made at the first call: most functions of the package are never called in a process of tests.
     """
     if inspect.isclass(function):
         if dataclasses.is_dataclass(function) and not hasattr(function.__init__, "checked"):
@@ -37,6 +38,23 @@ def checked(function: Any) -> Any:
         return function
     if inspect.isgeneratorfunction(function):  # its arguments count when it is called, not when it begins
         return _jaxtyped(function, typechecker=_comparing)
+    if not function.__annotations__:
+        return function
+    inner: Callable[..., Any] | None = None
+
+    @functools.wraps(function)
+    def outer(*args: Any, **kwargs: Any) -> Any:
+        nonlocal inner
+        inner = inner or _comparing(_with_resolved(function))
+        with _TOGETHER:
+            return inner(*args, **kwargs)
+
+    outer.checked = True
+    return outer
+
+
+def _with_resolved(function: types.FunctionType) -> types.FunctionType:
+    """A copy whose annotations are types."""
     copy = types.FunctionType(
         function.__code__,
         function.__globals__,
@@ -47,17 +65,7 @@ def checked(function: Any) -> Any:
     copy.__module__, copy.__qualname__ = function.__module__, function.__qualname__
     copy.__kwdefaults__ = function.__kwdefaults__
     copy.__annotations__ = {name: _resolved(one, function) for name, one in function.__annotations__.items()}
-    inner = _comparing(copy)
-    if inner is copy:
-        return function
-
-    @functools.wraps(function)
-    def outer(*args: Any, **kwargs: Any) -> Any:
-        with _TOGETHER:
-            return inner(*args, **kwargs)
-
-    outer.checked = True
-    return outer
+    return copy
 
 
 def _comparing(function: Callable[..., Any]) -> Callable[..., Any]:

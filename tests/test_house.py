@@ -7,7 +7,7 @@ import functools
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +65,13 @@ def files() -> list[Path]:
 
 
 @functools.cache
+def parsed(source: str) -> ast.Module:
+    """The tree of a text, which nobody may change."""
+    return ast.parse(source)
+
+
 def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+    return parsed(path.read_text())
 
 
 def room_of(module: str) -> str | None:
@@ -75,10 +80,20 @@ def room_of(module: str) -> str | None:
     return parts[1] if len(parts) > 1 and parts[1] != "__main__" else None
 
 
-def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
-    """Line and absolute dotted name of everything that a module imports, wherever in it."""
+def at_run_time(tree: ast.AST) -> Iterator[ast.AST]:
+    """All nodes but those for type checkers alone."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)):
+            yield node
+            waiting += ast.iter_child_nodes(node)
+
+
+def imports(nodes: Iterable[ast.AST], module: str, is_package: bool) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything that nodes of a module import."""
     here = module.split(".") if is_package else module.split(".")[:-1]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -91,9 +106,9 @@ def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[int,
 
 def complaints(source: str, module: str, is_package: bool = False) -> list[str]:
     """What a module does that the house forbids."""
-    room, tree = room_of(module), ast.parse(source)
+    room, tree = room_of(module), parsed(source)
     found = []
-    for line, name in imports(tree, module, is_package):
+    for line, name in imports(ast.walk(tree), module, is_package):
         top = name.split(".")[0]
         where = f"{module}:{line}"
         if top == PACKAGE.name:
@@ -155,13 +170,6 @@ MOST_REACHED = {
 """Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
 
 
-class _AtRunTime(ast.NodeTransformer):
-    """Without the imports of type checkers."""
-
-    def visit_If(self, node: ast.If) -> ast.AST | None:
-        return None if "TYPE_CHECKING" in ast.dump(node.test) else self.generic_visit(node)
-
-
 @functools.cache
 def followed() -> dict[str, set[str]]:
     """Modules that each module of the package imports, inside functions too; public names count as their homes."""
@@ -169,8 +177,8 @@ def followed() -> dict[str, set[str]]:
     public = {a.asname: n.module for n in stub.body if isinstance(n, ast.ImportFrom) for a in n.names}
     modules, edges = {module_name(path): path for path in files()}, {}
     for module, path in modules.items():
-        tree = _AtRunTime().visit(ast.parse(path.read_text()))  # which changes it
-        names = [name for _, name in imports(tree, module, path.name == "__init__.py")]
+        nodes = at_run_time(tree_of(path))
+        names = [name for _, name in imports(nodes, module, path.name == "__init__.py")]
         names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names if "." in name]
         homes = (name if name in modules else name.rpartition(".")[0] for name in names)
         edges[module] = {home for home in homes if home in modules and home != PACKAGE.name}
@@ -248,7 +256,7 @@ def test_every_library_is_declared():
     used = {
         name.split(".")[0]: module_name(path)
         for path in files()
-        for _, name in imports(tree_of(path), module_name(path), path.name == "__init__.py")
+        for _, name in imports(ast.walk(tree_of(path)), module_name(path), path.name == "__init__.py")
     }
     missing = set(used) - declared - set(sys.stdlib_module_names) - {PACKAGE.name}
     assert {name: used[name] for name in missing} == {}

@@ -6,14 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from changed_sets import with_block
 from frame_run import frame_run
 
 from walop_jax.calibration import residual_map
 from walop_jax.calibration.matrix import analysis_vectors, residual_names
 from walop_jax.calibration.residual_map import cell_of, cells_for, residual_map_at
-from walop_jax.data.records import Block
 from walop_jax.data.settings import Settings
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.parameters import values_of
@@ -26,13 +25,6 @@ BROKEN = np.array([3e-4, -2e-4, 5e-4, -4e-4, 1e-4, 6e-4, 2e-3])
 
 def as_values(instrument):
     return np.asarray(values_of(instrument))
-
-
-def changed(calset, counts, sigma):
-    """The set with other counts."""
-    block = calset.intensities.block(0, len(calset.points))
-    other = Block(block.x, block.y, counts, sigma, block.used, block.source)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, other))
 
 
 def with_structure(simulated, west):
@@ -59,7 +51,7 @@ def with_structure(simulated, west):
             counts[..., camera] += sign * flux * total * (light @ delta)
     counts[..., 2:] *= 1.0 + BROKEN[6]
     use = west[:, None, None] & e.clp_in[None, :, None]
-    return changed(calset, np.where(use, counts, block.counts), block.sigma)
+    return with_block(calset, counts=np.where(use, counts, block.counts))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +108,7 @@ def test_structure_below_the_noise_of_a_point_stands_out_of_many(cells, monkeypa
     clean = simulate(RUN, seed=8, noiseless=True)
     structure = with_structure(clean, np.ones(576, bool)).intensities.block(0, 576)
     added = structure.counts - clean.calset.intensities.block(0, 576).counts
-    calset = changed(simulated.calset, noise.counts + added, noise.sigma)
+    calset = with_block(simulated.calset, counts=noise.counts + added)
     found = residual_map_at(likelihood_of(calset), as_values(simulated.truth))
     assert found.significance() > 5
     weight = found.errors**-2

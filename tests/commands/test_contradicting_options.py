@@ -15,7 +15,6 @@ from small_run import small_fit
 
 import walop_jax as walop
 from walop_jax.commands.command import Command, Outcome, given, typed
-from walop_jax.fit import search
 from walop_jax.fit.outliers import Clipped
 from walop_jax.posterior.run import Run
 
@@ -129,18 +128,6 @@ def test_catalogues_of_cameras_that_exist_are_refused_before_the_work(call, here
     Path("sky_E1.fits").write_text("mine")
     refused = call("simulate", "plan.toml", "--stars", 5, "--cameras", "-o", "sky.fits")
     assert "sky_E1.fits: exists already" in refused.stderr
-
-
-def test_a_fit_that_fails_says_so_also_where_frames_were_to_be_compressed(
-    call, calset_file, here, monkeypatch
-):
-    begun = search.minimise
-    monkeypatch.setattr(search, "minimise", lambda *a, **k: begun(*a, **(k | {"maximum_steps": 1})))
-    done = call("refit", calset_file, "-o", "OUT", "--compress", "small.fits")
-    assert done.exit_code == 1
-    assert "did not converge" in done.stderr
-    assert [entry.name for entry in Path("OUT").iterdir()] == ["summary.failed.json"]
-    assert not Path("small.fits").exists()
 
 
 @pytest.mark.parametrize("command", ["epoch", "compare"])

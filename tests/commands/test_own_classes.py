@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from one_arm import POLARISER, one_arm
 
 import walop_jax as walop
 from walop_jax.diagnosis.hypotheses import applicable
@@ -45,28 +46,15 @@ class Grey(Element):
         kept = 1.0 - self.loss * jnp.ones_like(ray.wavelength)
         return jax.vmap(jnp.diag)(jnp.stack([jnp.ones_like(kept), kept, kept, jnp.ones_like(kept)], axis=-1))
 '''
-THREE = """
-name = "THREE"
-path = ["polariser", "grey"]
-[field]
-limit = 0.2
-scale = 0.1
-[cameras]
-names = ["left", "right"]
-[throughput]
-degree = 1
-[elements.polariser]
-kind = "polariser"
-moves = "CLP"
+GREY = """
 [elements.grey]
 kind = "grey_depolariser"
 loss = { value = 0.3, sigma = 0.02, unit = "", source = "a measurement" }
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["right", "left"]
 """
+THREE = one_arm(
+    "THREE", ["polariser", "grey"], POLARISER + GREY, field="limit = 0.2\nscale = 0.1", cameras=("left", "right"),
+    degree=1,
+)  # fmt: skip
 PLAN = 'instrument = "three.toml"\ngrid = 2\npolariser_angles = 6\nmoon_patches = 0\nstandards = 0\n'
 MISSPELT = "no part 'half2.plat'; did you mean 'plate'"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 
 import numpy as np
 import pytest
@@ -164,48 +165,41 @@ def test_duplicated_column(handmade):
         read_calibration_set(path)
 
 
-def test_duplicated_extension(handmade):
-    path = handmade.folder / "set.fits"
-    fits.HDUList([*handmade.hdus(), handmade.hdus()[2]]).writeto(path)
-    with pytest.raises(DataError, match=r"\[POINTS\]: is there twice"):
-        read_calibration_set(path)
+def twice(hdus):
+    hdus.append(hdus[2].copy())
 
 
-def test_image_in_the_place_of_a_table(handmade):
-    path = handmade.folder / "set.fits"
-    hdus = handmade.hdus()
+def image(hdus):
     hdus[2] = fits.ImageHDU(np.zeros((2, 2)), name="POINTS")
-    fits.HDUList(hdus).writeto(path)
-    with pytest.raises(DataError, match=r"\[POINTS\]: is not a binary table"):
-        read_calibration_set(path)
 
 
-def test_undefined_integer(handmade):
-    hdus = handmade.hdus()
-    table = hdus[2]
-    hdus[2] = fits.BinTableHDU.from_columns(
-        [fits.Column("POINT", "J", null=6, array=[5, 6, 7]), *list(table.columns)[1:]], name="POINTS"
-    )
-    path = handmade.folder / "set.fits"
-    fits.HDUList(hdus).writeto(path)
-    with pytest.raises(DataError, match=r"\[POINTS\] POINT: undefined \(TNULL\) in row 1"):
-        read_calibration_set(path)
+def undefined_integer(hdus):
+    numbers = fits.Column("POINT", "J", null=6, array=[5, 6, 7])
+    hdus[2] = fits.BinTableHDU.from_columns([numbers, *list(hdus[2].columns)[1:]], name="POINTS")
 
 
-def test_variable_length_arrays(handmade):
-    hdus = handmade.hdus()
+def variable_length(hdus):
     ragged = np.array([[0.57, 0.58]], dtype=object)
-    hdus[5] = fits.BinTableHDU.from_columns(
-        [
-            fits.Column("FILTER", "12A", array=["NARROW"]),
-            fits.Column("WAVELENGTH", "PD()", array=ragged),
-            fits.Column("THROUGHPUT", "PD()", array=ragged),
-        ],
-        name="FILTERS",
-    )
+    curves = [fits.Column(name, "PD()", array=ragged) for name in ("WAVELENGTH", "THROUGHPUT")]
+    names = fits.Column("FILTER", "12A", array=["NARROW"])
+    hdus[5] = fits.BinTableHDU.from_columns([names, *curves], name="FILTERS")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (twice, "[POINTS]: is there twice"),
+        (image, "[POINTS]: is not a binary table"),
+        (undefined_integer, "[POINTS] POINT: undefined (TNULL) in row 1"),
+        (variable_length, "[FILTERS] WAVELENGTH: is an array of variable length"),
+    ],
+)
+def test_extensions_that_cannot_be(handmade, change, message):
+    hdus = handmade.hdus()
+    change(hdus)
     path = handmade.folder / "set.fits"
     fits.HDUList(hdus).writeto(path)
-    with pytest.raises(DataError, match=r"\[FILTERS\] WAVELENGTH: is an array of variable length"):
+    with pytest.raises(DataError, match=re.escape(message)):
         read_calibration_set(path)
 
 

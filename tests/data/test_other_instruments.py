@@ -211,30 +211,28 @@ def test_a_name_that_cannot_be_read_is_not_written(two_cameras, name):
 GRID = Grid(4, 3, (2.5, 2.0), (0.0, 0.0), ((5.0, 0.0), (0.0, 5.0)))
 
 
-@pytest.fixture(params=[2, 3, 6])
-def frames(request, two_cameras):
-    """Frames of K cameras, and the block that is in them."""
-    lamps = read_calibration_set(two_cameras.write())
-    rng = np.random.default_rng(request.param)
-    shape = (12, 6, request.param)
-    counts = rng.integers(1000, 100000, shape) / 4
-    block = Block(
-        GRID.points.x,
-        GRID.points.y,
-        counts,
-        np.sqrt(counts),
-        rng.random(shape[:2]) > 0.2,
-        np.full(shape[:2], -1),
-    )
+def lamps_in_frames(two_cameras, calset, counts, used):
+    """Frames of the first exposures of a set, and the block that is in them."""
+    shape = counts.shape[:2]
+    block = Block(GRID.points.x, GRID.points.y, counts, np.sqrt(counts), used, np.full(shape, -1))
     scene = dataclasses.replace(
-        lamps,
-        exposures=lamps.exposures[:6],
+        calset,
+        exposures=calset.exposures[: shape[1]],
         points=GRID.points,
         intensities=TableIntensities.dense(GRID.points, block),
     )
     path = two_cameras.folder / "frames.fits"
     write_frames(path, scene, GRID, dtype="f8")
     return path, block
+
+
+@pytest.fixture(params=[2, 3, 6])
+def frames(request, two_cameras):
+    """Frames of K cameras, a fifth of the pixels not used, and the block that is in them."""
+    rng = np.random.default_rng(request.param)
+    counts = rng.integers(1000, 100000, (12, 6, request.param)) / 4
+    lamps = read_calibration_set(two_cameras.write())
+    return lamps_in_frames(two_cameras, lamps, counts, rng.random((12, 6)) > 0.2)
 
 
 def test_frames_of_any_number_of_cameras(frames):
@@ -311,19 +309,9 @@ def test_other_numbers_of_cameras_are_not_merged(two_cameras):
 def test_frames_and_table_of_two_cameras(two_cameras):
     table = two_cameras.write("table.fits")
     calset = read_calibration_set(table)
-    rng = np.random.default_rng(3)
-    counts = rng.integers(1000, 100000, (12, 6, 2)) / 4
-    block = Block(
-        GRID.points.x, GRID.points.y, counts, np.sqrt(counts), np.ones((12, 6), bool), np.full((12, 6), -1)
-    )
-    scene = dataclasses.replace(
-        calset,
-        exposures=calset.exposures[:6],
-        points=GRID.points,
-        intensities=TableIntensities.dense(GRID.points, block),
-    )
-    write_frames(two_cameras.folder / "frames.fits", scene, GRID, dtype="f8")
-    mixed = read_calibration_set(two_cameras.folder / "frames.fits", table)
+    counts = np.random.default_rng(3).integers(1000, 100000, (12, 6, 2)) / 4
+    path, _ = lamps_in_frames(two_cameras, calset, counts, np.ones((12, 6), bool))
+    mixed = read_calibration_set(path, table)
     assert (mixed.cameras, len(mixed.points), len(mixed.exposures)) == (2, 15, 14)
     whole = mixed.intensities.block(0, 15)
     np.testing.assert_array_equal(whole.counts[:12, :6], counts)

@@ -7,6 +7,7 @@ import class_scene
 import numpy as np
 import pytest
 from class_scene import TOLD
+from fits_with import examined_with, fit_with, set_with
 from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
@@ -16,17 +17,13 @@ from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
 from walop_jax.diagnosis.discrepancy import ambiguities
-from walop_jax.diagnosis.examination import examine
-from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import settled
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.effects.change import Change
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.specification import with_effects
 from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import simulate
 
@@ -142,15 +139,8 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
 def test_what_was_added_is_in_its_class_once():
     """A fit is no linear step: the same sentence by one step from nothing differs from it by more than its errors."""
     own, other = "depolarisation of polariser * r2", "depolarisation behind collimator * r2"
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([other], [6e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([own], [5e-3])], context)
-    said = [
-        probe
-        for probe in grammar.sentences(model.template, calset.exposures, len(calset.points))
-        if probe.name in (own, other)
-    ]
-    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(sentences=said), np.random.default_rng(0))
+    result = fit_with(set_with(3, {other: 6e-3}), Described.saying([own], [5e-3]))
+    state = examined_with(result, (own, other).__contains__)
     (found,) = ambiguities(state, {own: ()}).additions
     assert [member.name for member in found.members] == [own, other]
 
@@ -162,14 +152,10 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     """
     leak = "light of E1 in O1"
     rival = "diattenuation q behind half1.plate; diattenuation u behind half1.plate"
-    calset = simulate(SMALL, seed=4, effects=[Described.saying([leak], [1e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([leak], [1e-3])], context)
-    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
-    said = [probe for probe in asked if probe.name in (leak, rival)]
-    assert len(said) == 2
-    result = fit(Likelihood.of(calset, model))
-    state = examine(result, Hypotheses(sentences=said), np.random.default_rng(0))
+    calset = set_with(4, {leak: 1e-3})
+    result = fit_with(calset, Described.saying([leak], [1e-3]))
+    state = examined_with(result, (leak, rival).__contains__)
+    assert {leak, rival} <= {probe.name for probe in state.sentences}
     classes = ambiguities(state, {leak: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
     alone = Calibration.from_fit(result.judged())
@@ -178,34 +164,27 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     np.testing.assert_allclose(here[1], here[0], atol=1e-4)
 
 
-def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_another():
-    """A retardance that lens birefringence may be explains no spot."""
-    rival = "gain of O1 * hours"
+RIVAL = "gain of O1 * hours"
+
+
+@pytest.fixture(scope="module")
+def spotted():
+    """The fit of a set and a model with a spot, asked for a rival that is none."""
     spot = Blemish.of(SMALL.context(), x=0.1, y=0.05, size=0.1, depth=0.02)
     calset = simulate(SMALL, seed=5, effects=[spot]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    result = fit(Likelihood.of(calset, with_effects(base_model(calset), [spot], context)))
-    asked = grammar.sentences(result.model.template, calset.exposures, len(calset.points))
-    probes = Hypotheses(sentences=[probe for probe in asked if probe.name == rival])
-    state = examine(result, probes, np.random.default_rng(0))
-    classes = ambiguities(state, {"blemish": (), "lens_birefringence": [rival]})
-    assert classes.additions == ()
+    return examined_with(fit_with(calset, spot), RIVAL.__eq__)
 
 
-def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(monkeypatch):
+def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_another(spotted):
+    """A retardance that lens birefringence may be explains no spot."""
+    assert ambiguities(spotted, {"blemish": (), "lens_birefringence": [RIVAL]}).additions == ()
+
+
+def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(spotted, monkeypatch):
     """Without the spot its depth is 0, and not its size. Fits chose the spot: no member is more probable."""
     monkeypatch.setattr(Laid, "raised", lambda laid, evidence, best: max(evidence, best))
-    spot = Blemish.of(SMALL.context(), x=0.1, y=0.05, size=0.1, depth=0.02)
-    calset = simulate(SMALL, seed=5, effects=[spot]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    result = fit(Likelihood.of(calset, with_effects(base_model(calset), [spot], context)))
-    rivals = [
-        probe
-        for probe in grammar.sentences(result.model.template, calset.exposures, len(calset.points))
-        if probe.name == "gain of O1 * hours"
-    ]
-    state = examine(result, Hypotheses(sentences=rivals), np.random.default_rng(0))
-    (spots,) = ambiguities(state, {"blemish": [p.name for p in rivals]}).additions
+    result = spotted.result
+    (spots,) = ambiguities(spotted, {"blemish": [RIVAL]}).additions
     assert spots.members[0].probability >= spots.members[1].probability
     product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)))
     values = dict(zip(product.model.names, product.values, strict=True))
@@ -219,12 +198,8 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(monkeypatch):
 def test_what_the_model_has_beside_an_addition_does_not_replace_it():
     """Two things are there. "Without the first, and nothing in its place" is no explanation, whatever was reported."""
     first, second = "gain of O1 * kind moon", "gain of O2 * hours"
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([first, second], [3e-3, 3.4e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([first, second], [0.0, 0.0])], context)
-    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
-    probes = Hypotheses(sentences=[probe for probe in asked if probe.name in (first, second)])
-    state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
+    result = fit_with(set_with(3, {first: 3e-3, second: 3.4e-3}), first, second)
+    state = examined_with(result, (first, second).__contains__)
     groups = {first: (second,), second: (first,)}
     (moon,) = ambiguities(state, groups).additions
     assert [m.name for m in moon.members] == [first, "gain of O1 * kind clp; gain of O1 * kind standard"]
@@ -235,18 +210,12 @@ def test_what_the_model_has_beside_an_addition_does_not_replace_it():
 
 def test_a_time_that_is_the_time_of_one_kind_may_be_that_kind():
     """All exposures of standards are the last ones: a step in time, or standards, or all others the other way."""
-    calset = simulate(
-        SMALL, seed=3, effects=[Described.saying(["gain of O1 * kind standard"], [3e-3])]
-    ).calset
+    calset = set_with(3, {"gain of O1 * kind standard": 3e-3})
     e = calset.exposures
     hours = 24.0 * (e.mjd - e.mjd.min())
     start = 0.5 * (hours[e.kind == "standard"].min() + hours[e.kind != "standard"].max())
     text = f"gain of O1 * {grammar.between(start, grammar.end_of(e))}"
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
-    asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
-    probes = Hypotheses(sentences=[probe for probe in asked if probe.name == "gain of O1 * kind standard"])
-    state = examine(fit(Likelihood.of(calset, model)), probes, np.random.default_rng(0))
+    state = examined_with(fit_with(calset, text), "gain of O1 * kind standard".__eq__)
     (found,) = ambiguities(state, {text: ()}).additions
     assert [m.name for m in found.members] == [text, "gain of O1 * kind clp; gain of O1 * kind moon"]
     assert found.members[1].probability == pytest.approx(0.5, abs=0.05)
@@ -256,13 +225,8 @@ def test_the_other_kinds_are_as_probable_whatever_the_size():
     """An amplitude of five prior widths has a wider prior: the same one in the other exposures has that too."""
     text = "gain of O1 * kind standard"
     for size in (8e-3, 1.5e-2, 4e-2):
-        calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [size])]).calset
-        context = effect_context(base_model(calset).template, calset.exposures)
-        model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
-        asked = grammar.sentences(model.template, calset.exposures, len(calset.points))
-        probes = Hypotheses(sentences=[probe for probe in asked if probe.name.startswith("gain of O1")])
-        result = settled(fit(Likelihood.of(calset, model)), [Described.name])
-        state = examine(result, probes, np.random.default_rng(0))
+        result = settled(fit_with(set_with(3, {text: size}), text), [Described.name])
+        state = examined_with(result, lambda name: name.startswith("gain of O1"))
         (found,) = ambiguities(state, {text: ()}).additions
         sides = {m.name: m.probability for m in found.members}
         assert sides["gain of O1 * kind clp; gain of O1 * kind moon"] == pytest.approx(sides[text])

@@ -7,25 +7,22 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fits_with import examined_with, fit_with, set_with
 from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
 from walop_jax.diagnosis.class_product import averaged, only_a_class
 from walop_jax.diagnosis.discrepancy import ambiguities, shape_changes
-from walop_jax.diagnosis.examination import examine
-from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model, model_like
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import AtPoint, product
 from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.ray import Conditions, Ray
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.posterior.run import Run
 from walop_jax.science import epoch
 from walop_jax.simulation.simulate import simulate
@@ -36,10 +33,7 @@ TEXT, SIZE = "retardance v behind collimator * x", 4e-3
 @pytest.fixture(scope="module")
 def described():
     """A fit with one description, and what it leaves open."""
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([TEXT], [SIZE])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([TEXT], [0.0])], context)
-    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
+    state = examined_with(fit_with(set_with(3, {TEXT: SIZE}), TEXT))
     return state, ambiguities(state, {TEXT: ()})._replace(undetected=None)
 
 
@@ -133,17 +127,9 @@ def test_a_new_night_is_fitted_without_the_deviations(described):
 def test_a_hidden_deviation_is_in_the_errors():
     """Beside the fit of a model that has both: its size by the linear step from the description alone, √E[c²]."""
     other = "retardance v behind collimator * y"
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([TEXT, other], [SIZE, -1.5e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    one, both = (
-        fit(
-            Likelihood.of(
-                calset, with_effects(base_model(calset), [Described.saying(t, np.zeros(len(t)))], context)
-            )
-        )
-        for t in ([TEXT], [TEXT, other])
-    )
-    shape = ambiguities(examine(one, Hypotheses(), np.random.default_rng(0)), {TEXT: ()}).shape
+    calset = set_with(3, {TEXT: SIZE, other: -1.5e-3})
+    one, both = fit_with(calset, TEXT), fit_with(calset, TEXT, other)
+    shape = ambiguities(examined_with(one), {TEXT: ()}).shape
     j = [change.text for change in shape.changes].index(other)
     exact = both.values[both.model.index(f"described.{other.replace(' ', '_')}")]
     assert exact == pytest.approx(-1.5e-3, rel=0.3)
@@ -213,10 +199,7 @@ def test_a_mean_over_shapes_is_not_made_anew_as_one_fit(tmp_path):
 def test_deviations_of_the_polariser_do_nothing_to_a_star():
     """A star is seen without the polariser: of what its film may have, only the parameters of the fit know."""
     text = "retardance q of polariser * r2"
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([text], [4e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
-    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
+    state = examined_with(fit_with(set_with(3, {text: 4e-3}), text))
     classes = ambiguities(state, {text: ()})
     assert classes.shape.on_stars == ()
     alone = classes._replace(additions=(), undetected=None)
@@ -230,9 +213,7 @@ def test_deviations_of_sky_light_may_depend_on_the_temperature():
     calset = simulate(SMALL, seed=3).calset
     kelvin = 10.0 + np.linspace(-2.0, 2.0, len(calset.exposures))
     calset = dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, temp=kelvin))
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([text], [0.0])], context)
-    state = examine(fit(Likelihood.of(calset, model)), Hypotheses(), np.random.default_rng(0))
+    state = examined_with(fit_with(calset, text))
     classes = ambiguities(state, {text: ()})
     laws = {change.beside_field for change in classes.shape.changes}
     assert ("kelvin",) in laws

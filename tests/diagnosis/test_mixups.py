@@ -8,12 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from quick import quick
 from small_run import SEED, SMALL
 
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet, Position
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.readings import _angles, mixups
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
@@ -47,16 +47,11 @@ def without_plate() -> CalibrationSet:
 def with_data(
     calset: CalibrationSet, order: tuple[int, ...] = (0, 1, 2, 3), **points: np.ndarray
 ) -> CalibrationSet:
-    where = dataclasses.replace(calset.points, **points)
-    block = calset.intensities.block(0, len(where))
-    block = dataclasses.replace(
-        block,
-        counts=block.counts[..., list(order)],
-        sigma=block.sigma[..., list(order)],
-        x=where.x,
-        y=where.y,
+    where, block = dataclasses.replace(calset.points, **points), block_of(calset)
+    counts, sigma = block.counts[..., list(order)], block.sigma[..., list(order)]
+    return with_block(
+        dataclasses.replace(calset, points=where), counts=counts, sigma=sigma, x=where.x, y=where.y
     )
-    return dataclasses.replace(calset, points=where, intensities=TableIntensities.dense(where, block))
 
 
 def with_angle(calset: CalibrationSet, angle: np.ndarray, prefix: str = "CLP") -> CalibrationSet:
@@ -69,13 +64,11 @@ def unpolarised(simulated: Simulated) -> CalibrationSet:
     e = calset.exposures
     out = with_angle(calset, np.full(len(e), np.nan))
     model, true = base_model(out), truth_values(truth)
-    block = calset.intensities.block(0, len(calset.points))
+    block = block_of(calset)
     _, left = Likelihood.of(out, model).residuals(np.array([true[p.name] for p in model.parameters]))
     expected = np.where(block.used[..., None], block.counts - left * block.sigma, 0.0)
     noise = np.random.default_rng(1).standard_normal(expected.shape) * block.sigma
-    seen = np.where(e.clp_in[:, None], expected + noise, block.counts)
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=seen))
-    return dataclasses.replace(calset, intensities=table)
+    return with_block(calset, counts=np.where(e.clp_in[:, None], expected + noise, block.counts))
 
 
 def with_standards(calset: CalibrationSet, **columns: np.ndarray) -> CalibrationSet:
@@ -86,7 +79,7 @@ def with_intensities(
     calset: CalibrationSet, order: dict[int, int] | None = None, dead: tuple[int, slice] | None = None
 ) -> CalibrationSet:
     """Intensities of exposures exchanged; a camera that saw nothing but 700 electrons of bias in some of them."""
-    block, here = calset.intensities.block(0, len(calset.points)), np.arange(len(calset.exposures))
+    block, here = block_of(calset), np.arange(len(calset.exposures))
     for one, other in (order or {}).items():
         here[one] = other
     counts, sigma = block.counts[:, here].copy(), block.sigma[:, here].copy()
@@ -96,10 +89,9 @@ def with_intensities(
             counts[:, some, camera].shape
         )
         sigma[:, some, camera] = 30.0
-    block = dataclasses.replace(
-        block, counts=counts, sigma=sigma, used=block.used[:, here], source=block.source[:, here]
+    return with_block(
+        calset, counts=counts, sigma=sigma, used=block.used[:, here], source=block.source[:, here]
     )
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
 
 
 Spoil = Callable[[CalibrationSet], CalibrationSet]
@@ -187,12 +179,10 @@ def test_the_other_sign_of_u_is_told():
 
 def test_a_camera_with_one_number_everywhere_is_refused(without_plate):
     """Its errors as large as those of light, a fit takes it for a camera of low throughput: χ²/dof 1."""
-    block = without_plate.intensities.block(0, len(without_plate.points))
-    counts = block.counts.copy()
+    counts = block_of(without_plate).counts.copy()
     counts[..., 2] = 500.0
-    table = TableIntensities.dense(without_plate.points, dataclasses.replace(block, counts=counts))
     with pytest.raises(DataError, match="camera O2 has the same number everywhere"):
-        examined(plain_refit(dataclasses.replace(without_plate, intensities=table)))
+        examined(plain_refit(with_block(without_plate, counts=counts)))
 
 
 @pytest.mark.long
@@ -213,31 +203,24 @@ def test_a_fit_of_mixed_up_data_is_refused(calset):
 @pytest.mark.long
 def test_right_data_and_effects_are_no_mix_up(calset):
     """However large: an encoder error of 2°, and half the light of a camera."""
-    block = calset.intensities.block(0, len(calset.points))
     model = base_model(calset)
     assert mixups(calset, model, left=1.0) == ()
     wobble = 2.0 * np.sin(np.deg2rad(calset.exposures.clp_angle))
     assert mixups(with_angle(calset, calset.exposures.clp_angle + wobble), model, left=5e3) == ()
-    counts = block.counts * np.array([1.0, 0.5, 1.0, 1.0])
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts))
-    assert mixups(dataclasses.replace(calset, intensities=table), model, left=1e3) == ()
+    counts = block_of(calset).counts * np.array([1.0, 0.5, 1.0, 1.0])
+    assert mixups(with_block(calset, counts=counts), model, left=1e3) == ()
 
 
 @pytest.mark.long
 def test_errors_that_are_far_too_small_are_told_from_a_wrong_model(calset):
-    block = calset.intensities.block(0, len(calset.points))
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, sigma=block.sigma / 100.0))
-    result: FitResult = examined(plain_refit(dataclasses.replace(calset, intensities=table)))
+    result: FitResult = examined(plain_refit(with_block(calset, sigma=block_of(calset).sigma / 100.0)))
     assert not result.trusted
     assert any(re.search(r"N_ERR is (9\d|10\d)(\.\d)? times too small", text) for text in result.warnings)
 
 
 def test_cameras_in_different_units_are_seen_without_a_fit(calset):
-    block = calset.intensities.block(0, len(calset.points))
-    gain = np.array([1.0, 1.0, 4.0, 1.0])
-    table = TableIntensities.dense(
-        calset.points, dataclasses.replace(block, counts=block.counts / gain, sigma=block.sigma / gain)
-    )
-    findings = [str(one) for one in inspect(dataclasses.replace(calset, intensities=table)).findings]
+    block, gain = block_of(calset), np.array([1.0, 1.0, 4.0, 1.0])
+    other = with_block(calset, counts=block.counts / gain, sigma=block.sigma / gain)
+    findings = [str(one) for one in inspect(other).findings]
     assert any("N2 0.25" in text and "electrons" in text for text in findings)
     assert not any("between the cameras" in str(one) for one in inspect(calset).findings)

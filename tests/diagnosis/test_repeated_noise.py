@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from small_run import SEED, SMALL, small_fit
 
 from walop_jax.data.records import Position
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.variance_components import pairs_alike, repeated_noise
@@ -69,18 +69,14 @@ def test_a_copy_in_a_small_set_is_not_trusted():
     """Eleven exposures: too few for the reader to say whether there is noise at all."""
     plan = dataclasses.replace(SMALL, polariser_angles=polariser_turn(5), moon_patches=2, standards=2)
     calset = simulate(plan, seed=SEED).calset
-    block = calset.intensities.block(0, len(calset.points))
-    counts = block.counts.copy()
+    counts, sigma = (values.copy() for values in (block_of(calset).counts, block_of(calset).sigma))
     e = calset.exposures
     through = np.flatnonzero(e.clp_in)
     angle = e.clp_angle.copy()
     angle[through[1]] = angle[through[3]]
     counts[:, through[1]] = counts[:, through[3]] * 1.0001
-    sigma = block.sigma.copy()
     sigma[:, through[1]] = sigma[:, through[3]]
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts, sigma=sigma))
-    found = examined(
-        refit(dataclasses.replace(calset, intensities=table, exposures=e.placed(CLP=Position.at(angle))))
-    )
+    turned = dataclasses.replace(calset, exposures=e.placed(CLP=Position.at(angle)))
+    found = examined(refit(with_block(turned, counts=counts, sigma=sigma)))
     assert not found.trusted
     assert "the same noise" in "; ".join(found.verdict.doubts)

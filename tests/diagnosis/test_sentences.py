@@ -7,18 +7,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import pytest
 import scenes
-from small_run import SMALL
+from fits_with import fit_with, set_with
 
 from walop_jax.diagnosis.exact import try_effect
 from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.refits import settled
 from walop_jax.diagnosis.workflow import diagnose
-from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.cameras import Transmission
 from walop_jax.model.effects import Described, Effect
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
 
@@ -92,13 +89,12 @@ def test_halves_that_are_vignetted_differently():
 def test_a_further_sentence_leaves_the_priors_of_those_before():
     """The first is eight prior widths large, and has a wider prior since: beside a second it keeps that."""
     first, second = "gain of O1 * kind moon", "gain of O2 * hours"
-    calset = simulate(SMALL, seed=3, effects=[Described.saying([first, second], [2.4e-2, 2e-3])]).calset
-    context = effect_context(base_model(calset).template, calset.exposures)
-    model = with_effects(base_model(calset), [Described.saying([first], [0.0])], context)
-    alone = settled(fit(Likelihood.of(calset, model)), [Described.name])
+    calset = set_with(3, {first: 2.4e-2, second: 2e-3})
+    alone = settled(fit_with(calset, first), [Described.name])
     label = f"described.{first.replace(' ', '_')}"
     mean, width = alone.model[label].prior
     assert width > 2e-2
+    context = effect_context(alone.model.template, calset.exposures)
     trial = try_effect(alone, Described.saying([second], [0.0]), context)
     assert trial.fit.model[label].prior == (mean, width)
     # A prior of 0.3 % would pull at 2.4 %: by (8² − 1)/2 in ln B.

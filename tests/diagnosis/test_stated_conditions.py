@@ -9,6 +9,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from quick import quick
 from scipy import stats
 from small_run import SEED, SMALL, small_fit, small_fit_with_plate
@@ -18,7 +19,6 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
@@ -92,11 +92,9 @@ def of_date(calset: CalibrationSet, years: float = 80.0) -> CalibrationSet:
 
 def not_linear(calset: CalibrationSet) -> CalibrationSet:
     """The second camera answers with 0.4 % less at 10⁶ electrons."""
-    block = calset.intensities.block(0, len(calset.points))
-    counts = block.counts.copy()
+    counts = block_of(calset).counts.copy()
     counts[..., 1] *= 1.0 - 4e-3 * counts[..., 1] / 1e6
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=counts))
-    return dataclasses.replace(calset, intensities=table)
+    return with_block(calset, counts=counts)
 
 
 @pytest.mark.parametrize(
@@ -297,10 +295,9 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
 def test_a_number_that_explains_little_of_a_fit_far_off_is_not_told():
     """Gains of 3 % by exposure and camera: errors are multiplied to fit at all, and single numbers borrow a part."""
     calset = simulate(SMALL, seed=SEED).calset
-    block = calset.intensities.block(0, len(calset.points))
-    gain = 1.0 + 0.03 * np.random.default_rng(1).standard_normal(block.counts.shape[1:])
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block, counts=block.counts * gain))
-    result = refit(dataclasses.replace(calset, intensities=table))
+    counts = block_of(calset).counts
+    gain = 1.0 + 0.03 * np.random.default_rng(1).standard_normal(counts.shape[1:])
+    result = refit(with_block(calset, counts=counts * gain))
     assert result.noise_scale > 2.0
     design = Design.of(result)
     scores = Singles.of(design).testable

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from hypothesis import given
 from hypothesis import strategies as st
 from quick import quick
@@ -14,8 +15,7 @@ from scipy import stats
 from small_run import SMALL
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.records import Block, CalibrationSet, Compression
-from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.data.records import CalibrationSet, Compression
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined, group_scores
 from walop_jax.fit import refit as fitting
@@ -31,48 +31,38 @@ def refit(calset: CalibrationSet) -> FitResult:
     return examined(fitting.refit(calset))
 
 
-def block(calset: CalibrationSet) -> Block:
-    return calset.intensities.block(0, len(calset.points))
-
-
-def with_data(calset: CalibrationSet, **changed: np.ndarray) -> CalibrationSet:
-    table = TableIntensities.dense(calset.points, dataclasses.replace(block(calset), **changed))
-    return dataclasses.replace(calset, intensities=table)
-
-
 def background(calset: CalibrationSet) -> CalibrationSet:
     """2000 electrons that nobody has taken away."""
-    return with_data(calset, counts=block(calset).counts + 2000.0)
+    return with_block(calset, counts=block_of(calset).counts + 2000.0)
 
 
 def displaced(calset: CalibrationSet) -> CalibrationSet:
     """The centre of the field 36 arcsec from where it is said to be."""
     points = dataclasses.replace(calset.points, x=calset.points.x + 0.01)
-    seen = dataclasses.replace(block(calset), x=points.x)
-    return dataclasses.replace(calset, points=points, intensities=TableIntensities.dense(points, seen))
+    return with_block(dataclasses.replace(calset, points=points), x=points.x)
 
 
 def dark(calset: CalibrationSet) -> CalibrationSet:
     """One camera behind a closed shutter: nothing but read noise."""
-    counts = block(calset).counts.copy()
+    counts = block_of(calset).counts.copy()
     counts[..., 2] = np.random.default_rng(3).normal(5.0, 2.0, counts.shape[:-1])
-    return with_data(calset, counts=counts)
+    return with_block(calset, counts=counts)
 
 
 def variances(calset: CalibrationSet) -> CalibrationSet:
     """The variance where the standard error belongs."""
-    return with_data(calset, sigma=block(calset).sigma ** 2)
+    return with_block(calset, sigma=block_of(calset).sigma ** 2)
 
 
 def noisy_camera(calset: CalibrationSet) -> CalibrationSet:
     """One camera of half the stated errors, another of more, so that χ² of all is what it should be."""
-    seen = block(calset)
+    seen = block_of(calset)
     sigma = seen.sigma.copy()
     sigma[..., 0] *= 2.0
     sigma[..., 1] /= np.sqrt(4.0 / 3.0)
     sigma[..., 3] /= np.sqrt(4.0 / 3.0)
     sigma[..., 2] /= np.sqrt(4.0 / 3.0)
-    return with_data(calset, sigma=sigma)
+    return with_block(calset, sigma=sigma)
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +179,7 @@ def test_errors_a_few_per_cent_off_are_no_matter_of_the_model():
     """On a set so large that χ² shows it."""
     calset = simulate(ObservingPlan(grid=8), seed=7).calset
     clean = refit(calset)
-    found = refit(with_data(calset, sigma=0.93 * block(calset).sigma))
+    found = refit(with_block(calset, sigma=0.93 * block_of(calset).sigma))
     assert not found.explains_data
     assert found.trusted
     assert found.verdict.doubts == ()

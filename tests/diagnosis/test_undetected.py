@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from fits_with import examined_with, fit_with
 from scipy import integrate, stats
 from small_run import SMALL
 
@@ -18,11 +19,6 @@ from walop_jax.diagnosis.discrepancy import (
     _second_moments,
     ambiguities,
 )
-from walop_jax.diagnosis.examination import examine
-from walop_jax.diagnosis.hypotheses import Hypotheses
-from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit
-from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.posterior import draws
@@ -36,8 +32,8 @@ def fitted(seed: int, *texts: str, size: float = SIZE):
     """A fit of the base model, what may be undetected, and the truth of the set."""
     effects = [Described.saying(list(texts), [size] * len(texts))] if texts else []
     simulation = simulate(SMALL, seed=seed, effects=effects)
-    result = fit(Likelihood.of(simulation.calset, base_model(simulation.calset)))
-    classes = ambiguities(examine(result, Hypotheses(), np.random.default_rng(0)), {})
+    result = fit_with(simulation.calset)
+    classes = ambiguities(examined_with(result), {})
     assert not classes.several
     return result, classes.undetected, simulation
 
@@ -122,9 +118,8 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
     other, _, _ = fitted(3, drift, size=size)
     free = result.model.free
     shift = (other.values - result.values)[free] / size
-    asked = grammar.sentences(result.model.template, result.calset.exposures, len(result.calset.points))
-    (probe,) = (probe for probe in asked if probe.name == drift)
-    state = examine(result, Hypotheses(sentences=[probe]), np.random.default_rng(0))
+    state = examined_with(result, drift.__eq__)
+    (probe,) = (probe for probe in state.sentences if probe.name == drift)
     laid = Laid(state)
     root = _of_other_light(laid, LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows)))
     at = state.bare.places()[probe.name]

@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from small_run import SMALL, small_fit
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product, write_calibration
 from walop_jax.data.records import CalibrationSet
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.trust import examined
 from walop_jax.diagnosis.variance_components import ALARM, _Grouping, asked, groupings, variance_components
@@ -91,10 +91,9 @@ def test_noise_raises_an_alarm_as_seldom_as_promised(design):
 
 def with_gains(calset: CalibrationSet, size: float, seed: int = 3) -> CalibrationSet:
     """A gain of every field point and camera, the same in all exposures: a flat field that nobody divided by."""
-    block = calset.intensities.block(0, len(calset.points))
-    gain = 1.0 + size * np.random.default_rng(seed).standard_normal((len(block.x), 1, block.counts.shape[2]))
-    block = dataclasses.replace(block, counts=block.counts * gain)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+    counts = block_of(calset).counts
+    gain = 1.0 + size * np.random.default_rng(seed).standard_normal((len(counts), 1, counts.shape[2]))
+    return with_block(calset, counts=counts * gain)
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from small_run import SEED, SMALL
 
 from walop_jax.data.records import Position
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
@@ -24,17 +24,13 @@ def as_it_is(calset, rng):
 
 
 def with_cameras_exchanged(calset, rng):
-    block = calset.intensities.block(0, len(calset.points))
-    order = [2, 1, 0, 3]
-    block = dataclasses.replace(block, counts=block.counts[..., order], sigma=block.sigma[..., order])
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+    block, order = block_of(calset), [2, 1, 0, 3]
+    return with_block(calset, counts=block.counts[..., order], sigma=block.sigma[..., order])
 
 
 def with_random_intensities(calset, rng):
-    block = calset.intensities.block(0, len(calset.points))
-    counts = rng.uniform(1e5, 1e6, block.counts.shape)
-    block = dataclasses.replace(block, counts=counts, sigma=np.sqrt(counts))
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+    counts = rng.uniform(1e5, 1e6, block_of(calset).counts.shape)
+    return with_block(calset, counts=counts, sigma=np.sqrt(counts))
 
 
 def with_scrambled_angles(calset, rng):

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from changed_sets import block_of, with_block
 from small_run import small_fit
 
 from walop_jax.calibration.calibration import Calibration
@@ -13,7 +14,6 @@ from walop_jax.calibration.certify import certify
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.calibration.summary import summary
 from walop_jax.data.records import CalibrationSet, Position
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit import robust
 from walop_jax.fit.base_model import base_model
@@ -66,14 +66,8 @@ def test_a_good_fit_keeps_its_errors(clean):
 def test_understated_errors_are_found(clean):
     """N_ERR a third of the truth: errors of what has no prior become three times those stated, or somewhat more."""
     calset, true = clean
-    block = calset.intensities.block(0, len(calset.points))
-    claimed = dataclasses.replace(
-        calset,
-        intensities=TableIntensities.dense(
-            calset.points,
-            dataclasses.replace(block, sigma=np.where(block.used[..., None], block.sigma / 3.0, 1.0)),
-        ),
-    )
+    block = block_of(calset)
+    claimed = with_block(calset, sigma=np.where(block.used[..., None], block.sigma / 3.0, 1.0))
     plain = fit(Likelihood.of(claimed, base_model(claimed)))
     result = refit(claimed)
     free = [i for i in result.model.free if result.model.parameters[i].prior is None]

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from one_arm import one_arm
 from small_run import SEED, SMALL
 
 import walop_jax as walop
@@ -69,15 +70,7 @@ def test_tied_layers_move_together(north):
         assert all(start[i] == start[master] for i, master in ties(north.model))
 
 
-OTHER = """
-name = "ONE"
-path = ["turning"]
-[field]
-limit = 0.1
-[cameras]
-names = ["a", "b"]
-[throughput]
-degree = 0
+TURNING = """
 [elements.turning]
 kind = "wave_plate"
 moves = "HWP"
@@ -95,17 +88,12 @@ name = "thin"
 material = "quartz"
 axis = 45.0
 thickness = { value = 20.0, sigma = 1.0, unit = "um" }
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["a", "b"]
 """
 
 
 def test_layers_are_found_whatever_they_are_called():
     """Free ones of any crystal, those next to the air behind their plate first."""
-    model = model_without_data(build(parsed(OTHER, "a text")))
+    model = model_without_data(build(parsed(one_arm("ONE", ["turning"], TURNING), "a text")))
     found = [(model.names[i], layer.material) for i, layer in model.thicknesses().items()]
     assert found == [("turning.thin", "quartz"), ("t1", "mgf2")]
 

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from astropy.io import fits
+from changed_sets import block_of, with_block
 from frame_run import frame_run, raster
 from frames_file import write_frames
 
@@ -16,7 +17,6 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.grid import Grid
 from walop_jax.data.merge import merge_calibration_sets, without_frames
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
@@ -257,11 +257,9 @@ def test_the_fit_of_the_sums_ends_where_the_usual_one_ends(fitted, usual):
 def test_a_wave_of_five_pixels_is_told_of_frames_and_of_the_set_that_stands_for_them(path, fitted, tmp_path):
     """Gains of 0.1 % sin(2π column/5): 0.071 % rms, which no field point and no cell holds; errors are the same."""
     calset = read_calibration_set(path)
-    block = calset.intensities.block(0, SIDE**2)
     phase = 2 * np.pi * (np.arange(SIDE**2) % SIDE)[:, None] / 5 + np.arange(4)
-    block = dataclasses.replace(block, counts=block.counts * (1 + 1e-3 * np.sin(phase))[:, None])
-    table = TableIntensities.dense(calset.points, block)
-    rough = frames_of(dataclasses.replace(calset, intensities=table), tmp_path / "rough.fits", dtype="f8")
+    waved = with_block(calset, counts=block_of(calset).counts * (1 + 1e-3 * np.sin(phase))[:, None])
+    rough = frames_of(waved, tmp_path / "rough.fits", dtype="f8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(limits, "LARGE_ABOVE", 0)
         likelihood = Likelihood.of(read_calibration_set(rough), fitted.model, interpolate=True)

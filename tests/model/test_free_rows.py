@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from one_arm import POLARISER, one_arm
 
 import walop_jax as walop
 from walop_jax.calibration.matrix import instrument_matrices
@@ -22,31 +23,17 @@ from walop_jax.model.instrument import Instrument
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "notebooks"))
 from tables import bench_set, saying
 
-ONE_DETECTOR = """
-name = "ONE-DETECTOR"
-path = ["polariser", "plate"]
-[field]
-limit = 0.1
-[cameras]
-names = ["detector"]
-[throughput]
-degree = 0
-[elements.polariser]
-kind = "polariser"
-moves = "CLP"
-extinction = 0.0
+RETARDER = """
 [elements.plate]
 kind = "retarder"
 moves = "PLATE"
 delta = { value = 1.5, sigma = 0.5 }
 wavelength = 0.6
 axis = { value = 0.0, sigma = 5.0 }
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["detector"]
 """
+ONE_DETECTOR = one_arm(
+    "ONE-DETECTOR", ["polariser", "plate"], f"{POLARISER}extinction = 0.0\n{RETARDER}", cameras=["detector"]
+)
 FREE_ROWS = """
 name = "FREE-ROWS"
 path = ["polariser"]

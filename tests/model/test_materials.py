@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from one_arm import one_arm
 
 import walop_jax as walop
 from walop_jax.data.records import FilterCurve
@@ -85,27 +86,15 @@ material = "{material}"
 thickness = {{ value = 100.0, sigma = 1.0, unit = "um" }}
 """
 PLATE = """
-name = "INFRARED"
-path = ["plate"]
-[field]
-limit = 0.1
-[cameras]
-names = ["a", "b"]
-[throughput]
-degree = 0
 [elements.plate]
 kind = "wave_plate"
 {layer}
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["a", "b"]
 """
 
 
 def plan_of(material, first, last):
-    instrument = build(parsed(PLATE.format(layer=LAYER.format(material=material)), "a text"))
+    plate = PLATE.format(layer=LAYER.format(material=material))
+    instrument = build(parsed(one_arm("INFRARED", ["plate"], plate), "a text"))
     wavelength = np.linspace(first, last, 41)
     curve = FilterCurve("K", wavelength, np.ones(41))
     settings = dataclasses.replace(Settings.default(1), filter=np.array(["K"]))

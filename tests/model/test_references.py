@@ -3,35 +3,23 @@
 from __future__ import annotations
 
 import pytest
+from one_arm import one_arm
 
 from walop_jax.fit.model_file import model_without_data
 from walop_jax.instruments.description import parsed
 from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.references import bibtex, references
 
-OTHER = """
-name = "OTHER"
-path = ["plate"]
-{source}
-[field]
-limit = 0.1
-[cameras]
-names = ["a", "b"]
-[throughput]
-degree = 1
+RETARDER = """
 [elements.plate]
 kind = "retarder"
 delta = 1.0
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["a", "b"]
 """
 
 
 def cited(source: str, filters=()):
-    model = model_without_data(build(parsed(OTHER.format(source=source), "a text")))
+    text = one_arm("OTHER", ["plate"], RETARDER, head=source, degree=1)
+    model = model_without_data(build(parsed(text, "a text")))
     return {entry.what: entry.source for entry in references(model, filters)}
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from one_arm import POLARISER, one_arm
 from scipy.interpolate import CubicSpline
 
 from walop_jax.data.records import FilterCurve, Position
@@ -23,18 +24,7 @@ from walop_jax.model.ray import Conditions, Ray
 
 KNOTS = (1.1, 1.3, 1.45, 2.0, 2.4)
 VALUES = np.array([0.3, -0.2, 1.1, 0.9, 2.5])
-TEXT = """
-name = "CURVES"
-path = ["polariser", "mirrors"]
-[field]
-limit = 0.2
-[cameras]
-names = ["left", "right"]
-[throughput]
-degree = 0
-[elements.polariser]
-kind = "polariser"
-moves = "CLP"
+MIRRORS = """
 [elements.mirrors]
 kind = "spectral"
 moves = "DEROT"
@@ -43,13 +33,11 @@ delta_at = [1.1, 1.3, 1.45, 2.0, 2.4]
 delta = { value = [0.3, -0.2, 1.1, 0.9, 2.5], sigma = 0.1, unit = "rad" }
 diattenuation_at = [1.6]
 diattenuation = [0.05]
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["left", "right"]
-efficiency = 0.9
 """
+TEXT = one_arm(
+    "CURVES", ["polariser", "mirrors"], POLARISER + MIRRORS, field="limit = 0.2", cameras=("left", "right"),
+    analyser="efficiency = 0.9",
+)  # fmt: skip
 
 
 def ray(wavelength) -> Ray:

@@ -8,6 +8,7 @@ import builders
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from one_arm import POLARISER, one_arm
 
 import walop_jax as walop
 from walop_jax.calibration.matrix import matrix_draws
@@ -20,28 +21,10 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.planning import plan_for_settings
 
-ONE_PLATE = """
-name = "THICK"
-path = ["polariser", "pupil", "plate"]
-[field]
-limit = 0.35
-scale = 0.3
-[cameras]
-names = ["a", "b"]
-[throughput]
-degree = 0
-[elements.polariser]
-kind = "polariser"
-moves = "CLP"
+PUPIL = """
 [elements.pupil]
 kind = "pupil_mapping"
 magnification = 15.6
-{plate}
-[arms.main]
-path = ["analyser"]
-[arms.main.elements.analyser]
-kind = "analyser"
-cameras = ["a", "b"]
 """
 LAYER = """
 [[elements.plate.layers]]
@@ -54,7 +37,8 @@ AXIS = 20.0
 
 
 def instrument_of(plate: str):
-    return build(parsed(ONE_PLATE.format(plate=plate), "a text"))
+    path, elements = ["polariser", "pupil", "plate"], POLARISER + PUPIL + plate
+    return build(parsed(one_arm("THICK", path, elements, field="limit = 0.35\nscale = 0.3"), "a text"))
 
 
 def plate(*layers: tuple[str, float, float]) -> str:

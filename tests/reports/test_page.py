@@ -30,14 +30,16 @@ def page_of(folder) -> Page:
 
 
 @pytest.fixture(scope="module")
-def diagnosed(tmp_path_factory):
-    folder = handmade_run.make_diagnosis(tmp_path_factory.mktemp("runs") / "a <i>run")
-    return render(read_run(folder))[0]
+def folders(tmp_path_factory):
+    """A fit and a diagnosis, as `refit` and `diagnose` leave them."""
+    runs = tmp_path_factory.mktemp("runs")
+    return handmade_run.make_refit(runs / "run"), handmade_run.make_diagnosis(runs / "a <i>run")
 
 
 @pytest.fixture(scope="module")
-def refitted(tmp_path_factory):
-    return render(read_run(handmade_run.make_refit(tmp_path_factory.mktemp("runs") / "run")))[0]
+def drawn(folders):
+    """Their pages with all figures."""
+    return [render(read_run(folder))[0] for folder in folders]
 
 
 @pytest.fixture
@@ -46,8 +48,18 @@ def blank_figures(monkeypatch):
     monkeypatch.setattr(page_module, "draw", lambda name, source: Figure())
 
 
-def test_page_stands_by_itself(diagnosed, refitted):
-    for text in (diagnosed, refitted):
+@pytest.fixture
+def refitted(folders, blank_figures):
+    return render(read_run(folders[0]))[0]
+
+
+@pytest.fixture
+def diagnosed(folders, blank_figures):
+    return render(read_run(folders[1]))[0]
+
+
+def test_page_stands_by_itself(drawn):
+    for text in drawn:
         page = Page(text)
         for reference in page.references:
             inside = reference.startswith("data:image/") or reference.removeprefix("#") in page.ids
@@ -57,9 +69,9 @@ def test_page_stands_by_itself(diagnosed, refitted):
         assert all(image["alt"] for image in page.images)
 
 
-def test_figures_of_a_narrow_screen_have_the_width_of_a_column(refitted, diagnosed):
+def test_figures_of_a_narrow_screen_have_the_width_of_a_column(drawn):
     """89 mm, so that panels go below each other and type is of 7 pt; nothing has to be moved sideways."""
-    for text in (refitted, diagnosed):
+    for text in drawn:
         narrow = re.findall(
             r'media="screen and \(max-width: 40rem\)" srcset="data:image/svg[^,]*,([^"]*)"', text
         )
@@ -124,7 +136,8 @@ def test_a_no_go_stands_first(tmp_path, blank_figures):
     assert 'class="verdict good"' not in text
 
 
-def test_every_section_is_there(diagnosed, refitted):
+def test_every_section_is_there(drawn):
+    refitted, diagnosed = drawn
     both = [
         "Warnings",
         "Instrument matrix",

@@ -11,13 +11,19 @@ above these numbers is the fault of a calibration, and not below them.
 
 from __future__ import annotations
 
-import argparse
+import sys
+from pathlib import Path
 
 import numpy as np
 
-import walop_jax as walop
-from walop_jax.calibration.matrix import matrix_slopes
-from walop_jax.data.settings import Settings
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from study_options import options_of  # noqa: E402
+
+import walop_jax as walop  # noqa: E402
+from walop_jax.calibration.matrix import matrix_slopes  # noqa: E402
+from walop_jax.data.settings import Settings  # noqa: E402
 
 LIMITS = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
 PLACES, STAR_P, BEYOND, TOGETHER = 400, 0.02, 3.0, 500
@@ -49,11 +55,7 @@ def relative(slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Print the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=4)
-    parser.add_argument("--side", type=int, default=8)
-    options = parser.parse_args()
+    options = options_of(__doc__, draws=20_000, seed=4, side=8).parse_args()
     calset = walop.simulate(walop.ObservingPlan(grid=options.side), seed=options.seed).calset
     errors = relative_errors(walop.Calibration.from_fit(walop.refit(calset)))
     rng, shares = np.random.default_rng(options.seed), []

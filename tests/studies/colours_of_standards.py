@@ -8,7 +8,6 @@ standard errors of the fit. `--save` writes the sets, for versions that know no 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from study_options import options_of
 
 import walop_jax as walop
 from walop_jax.model.sources import Sight
@@ -54,9 +54,7 @@ def pulls(fit, truth) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0)
+    parser = options_of(__doc__, sets=40, first=0)
     parser.add_argument("--save", type=Path)
     given = parser.parse_args()
     false, every = 0, []

@@ -8,7 +8,6 @@ Printed is how many draws of all raise a doubt, question by question, and of any
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from collections import Counter
@@ -21,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from small_run import small_fit  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.diagnosis import thresholds, trust  # noqa: E402
 from walop_jax.diagnosis.design import Design, pattern_scores  # noqa: E402
@@ -44,10 +44,7 @@ def noise(design: Design, rng: np.random.Generator) -> np.ndarray:
 
 def main() -> None:
     """Print the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=3)
-    given = parser.parse_args()
+    given = options_of(__doc__, draws=1000, seed=3).parse_args()
     jax.config.update("jax_enable_x64", True)
     design, rng, found = Design.of(small_fit()), np.random.default_rng(given.seed), Counter[str]()
     rivals = [item.single for item in Singles.of(design).items]

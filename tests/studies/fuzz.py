@@ -18,7 +18,6 @@ they are a kind of damage of their own, `swap`.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import hashlib
 import signal
@@ -39,6 +38,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 import handmade_run  # noqa: E402
 from astropy.table import Table  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.product import read_product, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
@@ -233,10 +233,7 @@ def study(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=10000)
-    parser.add_argument("--others", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser = options_of(__doc__, sets=10000, others=2000, seed=0)
     parser.add_argument(
         "--keep", type=Path, default=None, help="folder for files answered silently or not at all"
     )

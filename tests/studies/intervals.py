@@ -15,7 +15,6 @@ non-linearity     coefficients of all cameras fitted; stars of a tenth and of th
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 import tempfile
@@ -26,12 +25,13 @@ import jax
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "studies")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from changed_sets import block_of, with_block  # noqa: E402
 from frame_run import frame_run  # noqa: E402
 from frames_file import write_frames  # noqa: E402
 from small_run import SMALL  # noqa: E402
-from trust import with_block  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
@@ -123,7 +123,7 @@ def pulls(
 def scattered(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]]]:
     for seed in range(runs):
         made = simulate(SMALL, seed=100 + seed)
-        counts = made.calset.intensities.block(0, len(made.calset.points)).counts
+        counts = block_of(made.calset).counts
         counts = counts + np.array([6e-4, 1.8e-4, 0.0, 0.0]) * np.median(counts, axis=0)
         found = examined(refit(with_block(made.calset, counts=counts)))
         yield found, pulls(Calibration.from_fit(found), made.truth, made.calset, np.random.default_rng(seed))
@@ -132,7 +132,7 @@ def scattered(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarr
 def gains(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]]]:
     for seed in range(runs):
         made, rng = simulate(SMALL, seed=200 + seed), np.random.default_rng(seed)
-        counts = made.calset.intensities.block(0, len(made.calset.points)).counts
+        counts = block_of(made.calset).counts
         counts = counts * rough(rng, made.calset.points.x)[:, None]
         found = examined(refit(with_block(made.calset, counts=counts)))
         yield found, pulls(Calibration.from_fit(found), made.truth, made.calset, rng, gains=rough)
@@ -147,7 +147,7 @@ def frames(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]
     phase = 2 * np.pi * (np.arange(side**2) % side)[:, None] / 5 + np.arange(4)
     for seed in range(runs):
         made = simulate(plan, seed=300 + seed)
-        counts = made.calset.intensities.block(0, side**2).counts * (1 + GAIN * np.sin(phase))[:, None]
+        counts = block_of(made.calset).counts * (1 + GAIN * np.sin(phase))[:, None]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "frames.fits"
             write_frames(path, with_block(made.calset, counts=counts), grid, dtype="f8")
@@ -193,12 +193,7 @@ def share(runs: list[np.ndarray], within: float) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--runs", type=int, default=60)
-    parser.add_argument("--frames", type=int, default=12)
-    options = parser.parse_args()
+    options = options_of(__doc__, runs=60, frames=12).parse_args()
     jax.config.update("jax_enable_x64", True)
     for name, study, runs in (
         ("no TEFF", colours, options.runs),

@@ -16,7 +16,6 @@ Counted are runs, states, and what was wrong; the exit status is 1 if anything w
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import hashlib
 import importlib
@@ -41,6 +40,7 @@ from commands.conftest import content  # noqa: E402
 from frame_run import raster  # noqa: E402
 from frames_file import write_frames  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 sampling = importlib.import_module("walop_jax.commands.sample")
 diagnosing = importlib.import_module("walop_jax.commands.diagnose")
@@ -320,10 +320,8 @@ def races(study: Study, count: int) -> tuple[int, list[str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options_of(__doc__, states=200, full=60, kills=0, races=0)
     parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
-    for name, count in {"states": 200, "full": 60, "kills": 0, "races": 0}.items():
-        parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args(arguments)
     switch_on()  # as the commands do: programs that were kept differ from others in the last digits
     warnings.simplefilter("ignore")

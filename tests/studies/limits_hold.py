@@ -12,7 +12,6 @@ sets     Whole data sets with and without an effect at 0.98 of the amplitude tha
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -28,6 +27,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from matrix_at import matrix_at  # noqa: E402
 from score_draws import alarms, noise_scores  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.accuracy import change_of_qu  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
@@ -141,10 +141,8 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
 
 def main() -> None:
     """Print the numbers of the study, and write them where a file is named."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options_of(__doc__, draws=2000, named=300, instruments=8, effects=99)
     parser.add_argument("output", nargs="?", type=Path)
-    for name, count in {"draws": 2000, "named": 300, "instruments": 8, "effects": 99}.items():
-        parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     found = {}

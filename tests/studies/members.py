@@ -9,13 +9,13 @@ and of the elements of the matrix, at 400 places.
 
 from __future__ import annotations
 
-import argparse
 from unittest import mock
 
 import jax
 import numpy as np
 from studies import sealed
 from studies.sealed_optics import Hidden
+from study_options import options_of
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis import grammar
@@ -53,10 +53,7 @@ def judged(seed: int) -> sealed.Judged:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=18)
-    parser.add_argument("--seed", type=int, default=26112610)
-    options = parser.parse_args()
+    options = options_of(__doc__, sets=18, seed=26112610).parse_args()
     jax.config.update("jax_enable_x64", True)
     every = [judged(options.seed + number) for number in range(options.sets)]
     for what in ("stars", "elements"):

@@ -13,7 +13,6 @@ the linearisation.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import os
@@ -36,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402
 from scipy import linalg, optimize, stats  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.accuracy import p_forms, sample_stars  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
@@ -569,12 +569,9 @@ STUDIES = {
 
 def main() -> None:
     """Run one study, or all."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__, start=0)
     parser.add_argument("study", choices=[*STUDIES, "all"])
     parser.add_argument("--count", type=int)
-    parser.add_argument("--start", type=int, default=0, help="number of the first series")
     given = parser.parse_args()
     for name, (study, count) in STUDIES.items():
         if given.study in (name, "all"):

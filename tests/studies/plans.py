@@ -17,7 +17,6 @@ diagnosed a run from end to end: a set is diagnosed, the exposures that tell apa
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import json
@@ -30,11 +29,14 @@ import jax
 import numpy as np
 from scipy.optimize import linprog
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from changed_sets import block_of, with_block  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 import walop_jax as walop  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis import thresholds  # noqa: E402
 from walop_jax.diagnosis.exact import try_effect  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
@@ -122,11 +124,10 @@ def scattered(calset: CalibrationSet, floor: float, seed: int) -> CalibrationSet
     """A set that scatters as a fit takes it to, where errors have a floor: what the model lacks is no photon noise."""
     if floor == 0.0:
         return calset
-    block = calset.intensities.block(0, len(calset.points))
+    block = block_of(calset)
     more = np.sqrt(with_floor(block.sigma, block.counts, floor) ** 2 - block.sigma**2)
     counts = block.counts + more * np.random.default_rng([seed, 1]).normal(size=block.counts.shape)
-    block = dataclasses.replace(block, counts=counts)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
+    return with_block(calset, counts=counts)
 
 
 def errors() -> None:
@@ -479,9 +480,7 @@ def diagnosed() -> None:
 
 def main() -> None:
     """Print the study."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options_of(__doc__)
     parts = {"errors": errors, "built": built, "beside": beside, "naming": naming, "diagnosed": diagnosed}
     parser.add_argument("parts", nargs="*", default=list(parts), choices=list(parts))
     for part in parser.parse_args().parts:

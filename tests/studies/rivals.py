@@ -27,7 +27,6 @@ name they tell all candidates that the data cannot tell from it (3 σ), as the s
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -44,6 +43,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 
 from generate import STEP  # noqa: E402
 from judge import opened  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.likelihood.inverses import whitening  # noqa: E402
 
@@ -554,7 +554,7 @@ def subset(bench: Bench, count: int) -> list[int]:
 
 def main() -> None:
     """Answer scenes, one line each, written as they come; scenes that are answered already are left out."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options_of(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("methods", nargs="*", help="default: all but process and formula")
     parser.add_argument("--scenes", type=int, help="the first of them only")

@@ -56,6 +56,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from oracle import forward  # noqa: E402
 from studies.sealed_judging import FEW, TEFF, Judged, homes_of, judged, right_of  # noqa: E402
 from studies.sealed_optics import Hidden, vectors  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
@@ -392,67 +393,49 @@ class Outcome(NamedTuple):
     """What became of a set."""
 
     text: str
-    held: float
-    before: Judged | None
-    after: Judged | None
-    verdict: str
-    p: float
-    has_class: bool
-    seconds: float
+    held: float = np.nan
+    before: Judged | None = None
+    after: Judged | None = None
+    verdict: str = ""
+    p: float = 0.0
+    has_class: bool = False
+    seconds: float = np.nan
     right: str = ""
 
 
 def outcome(number: int, options: argparse.Namespace) -> Outcome:
     """Fit and diagnose the set of a number."""
     one, began = sealed(number, options.seed, options.side), time.process_time()
+
+    def became(**what: Any) -> Outcome:
+        return Outcome(one.text, seconds=time.process_time() - began, **what)
+
     try:
         fitted = examined(refit(one.calset))
     except (DataError, ValueError) as error:
-        return Outcome(
-            one.text,
-            np.nan,
-            None,
-            None,
-            f"refused: {str(error)[:80]}",
-            0.0,
-            False,
-            time.process_time() - began,
-        )
+        return became(verdict=f"refused: {str(error)[:80]}")
     held = 0.0 if one.clean is one.calset else fitted.expansion.data - refit(one.clean).expansion.data
     before = judged(Calibration.from_fit(fitted), bool(fitted.trusted), one) if fitted.converged else None
+    of_fit = {"held": held, "before": before}
     if options.refit_only:
         after = judged(_with_undetected(fitted), True, one) if fitted.trusted else None
-        return Outcome(one.text, held, before, after, "", np.nan, False, time.process_time() - began)
+        return became(**of_fit, after=after, p=np.nan)
     try:
         found = diagnose(one.calset, minutes=options.minutes)
     except (DataError, ValueError) as error:
-        return Outcome(
-            one.text,
-            held,
-            before,
-            None,
-            f"refused: {str(error)[:80]}",
-            0.0,
-            False,
-            time.process_time() - began,
-        )
+        return became(**of_fit, verdict=f"refused: {str(error)[:80]}")
     trusted = found.after.trusted and found.verdict != "unexplained"
-    after = judged(found.calibration(), trusted, one)
     names = ", ".join(
         step.effect if not step.descriptions else "; ".join(c.text for c, *_ in step.descriptions)
         for step in found.steps
     )
-    verdict = f"{found.verdict} {names}".strip()
-    return Outcome(
-        one.text,
-        held,
-        before,
-        after,
-        verdict,
-        found.p_value,
-        found.members.several,
-        time.process_time() - began,
-        right_of(one, found),
+    return became(
+        **of_fit,
+        after=judged(found.calibration(), trusted, one),
+        verdict=f"{found.verdict} {names}".strip(),
+        p=found.p_value,
+        has_class=found.members.several,
+        right=right_of(one, found),
     )
 
 
@@ -562,12 +545,7 @@ def table(outcomes: list[Outcome]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=400)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=53)
-    parser.add_argument("--side", type=int, default=8)
-    parser.add_argument("--minutes", type=float, default=3.0)
+    parser = options_of(__doc__, sets=400, first=0, seed=53, side=8, minutes=3.0)
     parser.add_argument("--budget", type=float, default=np.inf, help="minutes after which no set is begun")
     parser.add_argument("--refit-only", action="store_true")
     parser.add_argument("--save", type=Path, help="file of the outcomes so far, written after every set")

@@ -10,7 +10,6 @@ before wrong. With `--every 4` a fourth of the scenes is taken.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 from unittest.mock import patch
@@ -24,6 +23,7 @@ sys.path[:0] = [
 ]
 
 from ablation import WORTH, Scenes  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.diagnosis import thresholds  # noqa: E402
 
@@ -53,10 +53,8 @@ def changed(scenes: Scenes, name: str, factor: float) -> tuple[int, int, int]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options_of(__doc__, each=1, quiet=12, pairs=12, seed=3, every=1)
     parser.add_argument("folder", type=Path)
-    for name, count in {"each": 1, "quiet": 12, "pairs": 12, "seed": 3, "every": 1}.items():
-        parser.add_argument(f"--{name}", type=int, default=count)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     scenes = Scenes(options.folder, options.seed, options.each, options.quiet, options.pairs)

@@ -15,7 +15,6 @@ wrong.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import sys
@@ -31,13 +30,14 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from changed_sets import block_of, with_block  # noqa: E402
 from small_run import SMALL  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.calibration.matrix import sky_vectors  # noqa: E402
 from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
-from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
@@ -76,11 +76,6 @@ class Judged(NamedTuple):
         return f"trusted, wrong, {'seen' if self.gain >= HELD else 'not seen'} by the data"
 
 
-def with_block(calset: CalibrationSet, **changed: np.ndarray) -> CalibrationSet:
-    block = dataclasses.replace(calset.intensities.block(0, len(calset.points)), **changed)
-    return dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, block))
-
-
 class Mistake(NamedTuple):
     """A set changed, and what the gains of the cameras at its field points became: (point, camera), 1 for most."""
 
@@ -92,16 +87,13 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
     """One mistake of each kind; those with a size have it drawn: 1 is about what the data just show."""
     size = 10.0 ** rng.uniform(-1.5, 1.0)
 
-    def block(calset: CalibrationSet):
-        return calset.intensities.block(0, len(calset.points))
-
     def plain(change: Change) -> Callable[[CalibrationSet], Mistake]:
         return lambda calset: Mistake(change(calset), np.ones((len(calset.points), calset.cameras)))
 
     def counted(
         change: Callable[[CalibrationSet, np.ndarray], np.ndarray],
     ) -> Callable[[CalibrationSet], Mistake]:
-        return plain(lambda c: with_block(c, counts=change(c, block(c).counts.copy())))
+        return plain(lambda c: with_block(c, counts=change(c, block_of(c).counts.copy())))
 
     def columns(**changed: Callable[[CalibrationSet], Any]) -> Callable[[CalibrationSet], Mistake]:
         def change(c: CalibrationSet) -> CalibrationSet:
@@ -147,7 +139,7 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
 
     def rough(share: float) -> Callable[[CalibrationSet], Mistake]:
         def change(calset: CalibrationSet) -> Mistake:
-            there = block(calset).counts
+            there = block_of(calset).counts
             shape = (there.shape[0], there.shape[2])
             gains = 1.0 + 5e-4 * size / np.sqrt(share) * rng.standard_normal(shape) * (
                 rng.random(shape) < share
@@ -191,7 +183,7 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         return dataclasses.replace(calset, filters=moved)
 
     def errors_of_one(calset: CalibrationSet) -> CalibrationSet:
-        sigma = block(calset).sigma.copy()
+        sigma = block_of(calset).sigma.copy()
         sigma[..., rng.integers(sigma.shape[2])] *= 1.0 + 0.3 * size
         return with_block(calset, sigma=sigma)
 
@@ -199,13 +191,13 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         "light left in": counted(lambda _, counts: counts + 500.0 * size),
         "field displaced": plain(displaced),
         "dark camera": counted(dark),
-        "errors too large": plain(lambda c: with_block(c, sigma=100.0 * block(c).sigma)),
-        "errors too small": plain(lambda c: with_block(c, sigma=0.01 * block(c).sigma)),
+        "errors too large": plain(lambda c: with_block(c, sigma=100.0 * block_of(c).sigma)),
+        "errors too small": plain(lambda c: with_block(c, sigma=0.01 * block_of(c).sigma)),
         "errors of one camera": plain(errors_of_one),
         "lamp of another temperature": columns(teff=lamp),
         "cameras exchanged": plain(
             lambda c: with_block(
-                c, counts=block(c).counts[..., [2, 3, 0, 1]], sigma=block(c).sigma[..., [2, 3, 0, 1]]
+                c, counts=block_of(c).counts[..., [2, 3, 0, 1]], sigma=block_of(c).sigma[..., [2, 3, 0, 1]]
             )
         ),
         "polariser backwards": columns(
@@ -296,11 +288,7 @@ def judged(number: int, seed: int) -> Judged:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=600)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=77)
-    options = parser.parse_args()
+    options = options_of(__doc__, sets=600, first=0, seed=77).parse_args()
     jax.config.update("jax_enable_x64", True)
     found: Counter[tuple[str, str]] = Counter()
     for number in range(options.first, options.first + options.sets):

@@ -13,7 +13,6 @@ Before these: false alarms of the comparison of stars at two places of the field
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import sys
@@ -28,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from small_run import small_fit_with_plate  # noqa: E402
+from study_options import options_of  # noqa: E402
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
@@ -220,13 +220,7 @@ def spots(depth: float, radius: float, count: int) -> str:
 
 def main() -> None:
     """Print the study."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--quiet", type=int, default=500)
-    parser.add_argument("--each", type=int, default=100)
-    parser.add_argument("--overlaps", type=int, default=200)
-    given = parser.parse_args()
+    given = options_of(__doc__, quiet=500, each=100, overlaps=200).parse_args()
     application.AnalysisVectors = lambda calibration: vectors()  # those of the one calibration, made once
     for stars in STARS[:2]:
         seen = [overlapping(stars, seed) for seed in range(given.overlaps // 2)]

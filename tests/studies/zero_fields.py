@@ -9,12 +9,12 @@ n places. Exposures of a field share its time.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 
 import numpy as np
 from matrix_at import matrix_at
+from study_options import options_of
 
 import walop_jax as walop
 from walop_jax.calibration.matrix import matrices
@@ -44,9 +44,7 @@ def shortened(run: Simulated, share: float, seed: int) -> walop.CalibrationSet:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=10)
-    parser.add_argument("--stars", type=int, default=100)
+    parser = options_of(__doc__, sets=10, stars=100)
     parser.add_argument("--exposures", type=int, nargs="+", default=[1, 4])
     given = parser.parse_args()
     side = round(given.stars**0.5)
