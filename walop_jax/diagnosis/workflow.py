@@ -39,11 +39,10 @@ from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
-from walop_jax.diagnosis.remainder import back_to, concluded
-from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
+from walop_jax.diagnosis.remainder import back_to, concluded, instead_of_names, rival_conditions
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
-from walop_jax.diagnosis.stated_conditions import condition_scores
+from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
@@ -108,8 +107,8 @@ def diagnose(
     # Another reading that comes near competes with names and with other descriptions of the instrument.
     if remainder and readings and readings[0].explained * after.dof < after.chi2:
         raise refusal(before, readings)
-    conditions = condition_scores(first.evidence.design) if state.steps or remainder else []
-    if stated := instead_of_names(conditions, before, after) if conditions else "":
+    conditions = condition_scores(first.evidence.design) if state.steps or remainder else Singles()
+    if stated := instead_of_names(conditions, before, after) if conditions.items else "":
         partial = () if remainder is None else remainder.parts
         names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
         text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
