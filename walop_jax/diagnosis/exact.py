@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, Comparison
 from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, Vector, fit
@@ -46,10 +46,11 @@ from walop_jax.model.specification import Model, effect_context, model_without, 
 class Trial:
     """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
-    `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
+    `item` is its linear step, `linear` the evidence of that (NaN where there was none), `score` and `p_value` are those
+    of the linear test when it was added. `fit` is None until it has been
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
-    where its linear step does not predict held-out data, `compared` holds the comparison of two fits
+    where its linear step does not predict held-out data, `compared` are the fits without and with it
     (`refits.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
     which it was not added, `groups` the groups of sentences that were added one after the other, each with the
     candidates that were as good then.
@@ -66,7 +67,9 @@ class Trial:
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
     predicts: bool = True
-    compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    compared: Comparison = dataclasses.field(default_factory=Comparison)
+    score: float = float("nan")
+    p_value: float = float("nan")
     against: str = ""
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)

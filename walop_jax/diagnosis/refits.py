@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +23,7 @@ from walop_jax.diagnosis.exact import (
     with_refuted_priors_widened,
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, Comparison
 from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.diagnosis.search import State, names_first
@@ -126,8 +126,7 @@ class Refits:
         assert trial.fit is not None
         after = Design.of(trial.fit)
         compared = before_and_after(trial.effect.name, evidence.design, after)
-        closer = compared["heldout_after"] < compared["heldout_before"]
-        against = contradicting(evidence.design, after) if closer else ""
+        against = contradicting(evidence.design, after) if compared.confirmed else ""
         if against:
             self.tell(f"{trial.name}: exposures of {against} speak against it")
         return dataclasses.replace(trial, compared=compared, against=against)
@@ -151,21 +150,25 @@ class Refits:
         assert trial.fit is not None
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
-        compared, alike = dict(trial.compared), (*trial.rivals, *trial.nameless)
+        compared, alike = trial.compared, (*trial.rivals, *trial.nameless)
         groups = {trial.name: alike} if trial.effect is Described else {}
         if result is not trial.fit:
-            compared |= before_and_after(name, evidence.design, Design.of(result))
+            compared = before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
         table = evidence.table
-        compared["score"] = item.score.statistic if item else evidence.chi2 - trial.left
-        compared["p_value"] = table.corrected(item.score) if item else table.p_global
+        score = item.score.statistic if item else evidence.chi2 - trial.left
+        p_value = table.corrected(item.score) if item else table.p_global
         steps = [step for step in state.steps if step.effect is not trial.effect]
         # A further change of the description joins those before.
         for earlier in (step for step in state.steps if step.effect is trial.effect):
-            before = "chi2_before", "heldout_before", "residual_before"
-            compared |= {key: earlier.compared[key] for key in before}
+            compared = dataclasses.replace(
+                compared,
+                chi2_before=earlier.compared.chi2_before,
+                heldout_before=earlier.compared.heldout_before,
+                residual_before=earlier.compared.residual_before,
+            )
             groups = {**earlier.groups, **groups}
-        step = dataclasses.replace(trial, compared=compared, groups=groups)
+        step = dataclasses.replace(trial, compared=compared, score=score, p_value=p_value, groups=groups)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
 
@@ -214,7 +217,7 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
     compared, before = [], start
     for step, result in zip(steps, reversed(fits), strict=True):
         after = end if result is end.fit else Design.of(result)
-        changed = {**step.compared, **before_and_after(step.effect.name, before, after)}
+        changed = before_and_after(step.effect.name, before, after)
         compared.append(dataclasses.replace(step, compared=changed))
         before = after
     return compared
@@ -223,23 +226,23 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
 LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 
-def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
-    """The fields of a `Step` that compare the fits without and with an effect."""
+def before_and_after(name: str, before: Design, after: Design) -> Comparison:
+    """The fits without and with an effect."""
     effect = after.fit.model.template.effect(name)
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
     scheme = "field blocks" if many or _of_one_fold(after, name) else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
-    return {
-        "chi2_before": before.fit.chi2,
-        "chi2_after": after.fit.chi2,
-        "dof_after": after.fit.dof,
-        "heldout_scheme": scheme,
-        "heldout_before": held_out(before, scheme),
-        "heldout_after": held_out(after, scheme),
-        "change_of_qu": largest_change(old, new),
-        "residual_before": before.measured.residual,
-        "residual_after": after.measured.residual,
-    }
+    return Comparison(
+        chi2_before=before.fit.chi2,
+        chi2_after=after.fit.chi2,
+        dof_after=after.fit.dof,
+        heldout_scheme=scheme,
+        heldout_before=held_out(before, scheme),
+        heldout_after=held_out(after, scheme),
+        change_of_qu=largest_change(old, new),
+        residual_before=before.measured.residual,
+        residual_after=after.measured.residual,
+    )
 
 
 def _of_one_fold(design: Design, name: str) -> bool:

@@ -144,7 +144,7 @@ def _parts(first: State, state: State) -> dict[str, str]:
         return {}
     partial = {}
     for step in (step for step in state.steps if step.effect is not OtherDescription):
-        before, after = (step.compared[f"chi2_{when}"] / freedom for when in ("before", "after"))
+        before, after = step.compared.chi2_before / freedom, step.compared.chi2_after / freedom
         partial[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
     return partial
 
@@ -211,7 +211,7 @@ def _worse(first: Examination, state: State) -> str:
     if not state.steps:  # numbers of a free-form term for single exposures predict no others
         return ""
     # A number for every exposure predicts no exposure that is left out, but places in the field.
-    schemes = [step.compared["heldout_scheme"] for step in state.steps]
+    schemes = [step.compared.heldout_scheme for step in state.steps]
     scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
     before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
@@ -221,7 +221,7 @@ def _worse(first: Examination, state: State) -> str:
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     """The first model again: the additions are reported as parts."""
-    changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
+    changes = ((s.effect.name, s.compared.chi2_before, s.compared.chi2_after) for s in state.steps)
     partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     added = "; ".join(partial) or "a free-form term"
     text = f"the model with all additions predicts worse {worse}, so nothing was adopted: {added}"
