@@ -19,7 +19,7 @@ from walop_jax.diagnosis.search import State
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, FreeForm, effect_by_name
+from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.specification import model_without
 from walop_jax.simulation.simulate import simulate
 
@@ -95,7 +95,7 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypat
 
 
 def test_when_time_or_fits_are_over_nothing_further_is_tried():
-    how = (Context(), Hypotheses(), np.random.default_rng(0), lambda text: None)
+    how = (Hypotheses(), np.random.default_rng(0), lambda text: None)
     assert Refits(*how, minutes=0.0).over(0) == "0 minutes"
     assert Refits(*how).over(thresholds.MOST_FITS) == f"{thresholds.MOST_FITS} fits"
     assert Refits(*how).over(0) == ""

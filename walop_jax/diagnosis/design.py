@@ -320,15 +320,16 @@ class Design:
         fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
         return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
-    def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
-        """True for the columns of the Jacobian that belong to an effect."""
-        return np.isin(self.fit.model.free, self.fit.model.positions(name))
+    def columns_of(self, name: str) -> Int[np.ndarray, " a"]:
+        """Columns of the Jacobian that belong to an effect."""
+        return np.flatnonzero(np.isin(self.fit.model.free, self.fit.model.positions(name)))
 
-    def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """Projector off all parameters but those of one effect, and an orthonormal basis of its projected columns."""
-        of_effect = self._columns_of(name)
-        projector = Projector(self.jacobian[:, ~of_effect], self.eliminated)
-        projected = projector(self.jacobian[:, of_effect])
+    def without(self, at: Int[np.ndarray, " a"]) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
+        """Projector off all parameters but some, and an orthonormal basis of the projected columns of these."""
+        if not len(at):
+            return self.projector, np.zeros((len(self.residual), 0))
+        projector = Projector(np.delete(self.jacobian, at, axis=1), self.eliminated)
+        projected = projector(self.jacobian[:, at])
         return projector, projected @ whitening(projected.T @ projected)
 
     def stacked(self, columns: Sequence[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
@@ -367,7 +368,7 @@ class Design:
         H = JᵀJ and g_e the gradient of exposure e (White 1982, Econometrica 50, 1; Liang & Zeger 1986, Biometrika 73,
         13).
         """
-        at = np.flatnonzero(self._columns_of(name))
+        at = self.columns_of(name)
         if not len(at):
             return float("nan")
         scaled, _ = unit_columns(self.jacobian)

@@ -352,13 +352,17 @@ class Examination(Evidence):
             effect.name for effect in catalogue if effect.name not in testable and not effect.is_structural()
         )
 
+    def space_beside(self, basis: Matrix) -> tuple[Matrix, ScoreSpace]:
+        """Products of all columns with a basis of parameters that are taken out (`Design.without`); the space then."""
+        along = self.design.products(self.columns, basis)
+        return along, dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
+
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
         design, columns = self.design, self.columns
-        rest, basis = design.without(name)
-        along = design.products(columns, basis)
+        rest, basis = design.without(design.columns_of(name))
+        along, space = self.space_beside(basis)
         projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
-        space = dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
         scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)
         distances = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in distances.items()}

@@ -16,6 +16,7 @@ from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, exposure_folds, held_out
 from walop_jax.diagnosis.exact import (
     Trial,
+    context_of,
     other_descriptions,
     refit_without,
     try_effect,
@@ -32,7 +33,7 @@ from walop_jax.fit.robust import field_cells, states
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Described
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,6 @@ class Refits:
     takes).
     """
 
-    context: Context
     hypotheses: Hypotheses
     rng: np.random.Generator
     tell: Callable[[str], None]
@@ -80,10 +80,10 @@ class Refits:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
             description = self._with_best_times(evidence, shortest(item))
-            refitted = try_effect(evidence.result, description, self.context, len(evidence.sentences))
+            refitted = try_effect(evidence.result, description, len(evidence.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
-            refitted = try_shapes(evidence.result, item, self.context, shapes)
+            refitted = try_shapes(evidence.result, item, shapes)
         return dataclasses.replace(refitted, item=item, linear=trial.linear)
 
     def _with_best_times(self, evidence: Examination, description: Described) -> Described:
@@ -115,9 +115,9 @@ class Refits:
         for effect in self.hypotheses.effects if state.evidence.poor else ():
             if effect.is_structural() and effect.name not in result.model.effect_names and allowed():
                 self.tell(f"trying {effect.name}")
-                trials.append(try_effect(result, effect.neutral(self.context), self.context))
+                trials.append(try_effect(result, effect.neutral(context_of(result))))
         described, compared = other_descriptions(
-            result, self.context, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
+            result, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
         )
         return [*trials, *described], {**state.choices, **compared}
 

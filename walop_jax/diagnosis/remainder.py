@@ -15,7 +15,7 @@ from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design, held_out, strata
-from walop_jax.diagnosis.exact import Trial, evidence_of_presence, log_evidence_ratio, try_effect
+from walop_jax.diagnosis.exact import Trial, context_of, evidence_of_presence, log_evidence_ratio, try_effect
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Unexplained, describe
 from walop_jax.diagnosis.refits import (
@@ -167,7 +167,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
     if not useful:
         return _and(remainder, _LEFT_OUT), None
-    trial = try_effect(result, FreeForm.of(judge.context, blocks=useful), judge.context)
+    trial = try_effect(result, FreeForm.of(context_of(result), blocks=useful))
     if trial.fit is None or not trial.fit.converged:
         return remainder, None
     after = settled(trial.fit, [step.effect.name for step in state.steps])

@@ -51,9 +51,9 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, EffectKind
+from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.parameters import values_of
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import Model
 
 
 def diagnose(
@@ -81,7 +81,6 @@ def diagnose(
     model = model or base_model(calset)
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
-    context = effect_context(model.template, calset.exposures)
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
     sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)
     if len(sample.points) < len(calset.points):
@@ -92,7 +91,6 @@ def diagnose(
     if readings and readings[0].explained < thresholds.READING_SURE:
         raise refusal(before, readings)
     judge = Refits(
-        context=context,
         hypotheses=candidates,
         rng=np.random.default_rng(seed),
         tell=tell,
@@ -116,7 +114,7 @@ def diagnose(
         state = back_to(first, state)
         after = before
     evidence, added = state.evidence, [step.effect.name for step in state.steps]
-    steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
+    steps = tuple(_finished(step, evidence, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
     alike = dict[str, Collection[str]]()
@@ -199,10 +197,10 @@ def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict
     return reasons | {probe.name: name for probe in candidates.every if probe.name not in scored}
 
 
-def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequence[str]) -> Step:
+def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step:
     """An addition with its final parameters, what cannot be separated from it, and where it sits."""
     result, name = evidence.result, trial.effect.name
-    change = signature(result, name, context)
+    change = signature(result, name)
     separation = evidence.separation(name, change)
     close = {rival for rival, s in separation.items() if s < thresholds.SEPARATION} | set(trial.rivals)
     close -= set(added)
