@@ -117,7 +117,7 @@ def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
 def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
     """Each exposure pulls the magnification by five times what noise lets it."""
     design = Design.of(leaking[-1])
-    column = design.without(design.columns_of("pupil"))[1][: design.rows, 0]
+    column = design.without(design.columns_of(design.fit.model.positions("pupil")))[1][: design.rows, 0]
     length = np.sqrt(np.bincount(design.exposure, column**2))
     pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
     disturbed = design.residual.copy()

@@ -57,30 +57,23 @@ def classes_of(
     it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are sentences that
     the model had before.
     """
-    return tuple(group for group in _classes(laid, added, given) if group.names)
-
-
-def _classes(laid: Laid, added: Mapping[str, Collection[str]], given: Collection[str]) -> Iterator[ClassOf]:
-    fit, model = laid.fit, laid.fit.model
-    groups = [name for name in added if name not in model.effect_names]
-    place = {int(i): k for k, i in enumerate(model.free)}
-    slope: Matrix | None = None
+    fit, model, design = laid.fit, laid.fit.model, laid.design
+    groups, classes = [name for name in added if name not in model.effect_names], list[ClassOf]()
     for effect in model.effects:
-        if effect.name in added and not effect.kind.is_structural():
-            at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
-            if at:
-                change = signature(fit, effect.name)
-                sums = tuple(map(tuple, effect.first_order(model.template)))
-                yield laid.class_of(effect.name, np.array(at), change, sums, added[effect.name])
+        at = design.columns_of(model.positions(effect.name))
+        if effect.name in added and not effect.kind.is_structural() and len(at):
+            change, sums = signature(fit, effect.name), tuple(map(tuple, effect.first_order(model.template)))
+            classes.append(laid.class_of(effect.name, at, change, sums, added[effect.name]))
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
-            indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
-            at = [place[i] for i in indices if i in place]
-            if not at:
-                continue
-            slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
-            change = -slope[:, at] @ fit.values[model.free[at]]
-            sums = tuple(((1.0, Sentence.parsed(text)),) for text in group)
-            yield laid.class_of("; ".join(group), np.array(at), change, sums, added.get(name, ()))
+            sentences = [Sentence.parsed(text) for text in group]
+            at = design.columns_of(
+                [model.index(f"{Described.name}.{sentence.label}") for sentence in sentences]
+            )
+            if len(at):
+                change = -design.jacobian[: design.rows, at] @ fit.values[model.free[at]]
+                sums = tuple(((1.0, sentence),) for sentence in sentences)
+                classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ())))
+    return tuple(group for group in classes if group.names)
 
 
 def _groups(

@@ -360,7 +360,7 @@ class Examination(Evidence):
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
         design, columns = self.design, self.columns
-        rest, basis = design.without(design.columns_of(name))
+        rest, basis = design.without(design.columns_of(self.result.model.positions(name)))
         along, space = self.space_beside(basis)
         projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
         scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)

@@ -161,11 +161,9 @@ class Refits:
         steps = [step for step in state.steps if step.effect is not trial.effect]
         # A further change of the description joins those before.
         for earlier in (step for step in state.steps if step.effect is trial.effect):
+            before = "chi2_before", "heldout_before", "residual_before"
             compared = dataclasses.replace(
-                compared,
-                chi2_before=earlier.compared.chi2_before,
-                heldout_before=earlier.compared.heldout_before,
-                residual_before=earlier.compared.residual_before,
+                compared, **{key: getattr(earlier.compared, key) for key in before}
             )
             groups = {**earlier.groups, **groups}
         step = dataclasses.replace(trial, compared=compared, score=score, p_value=p_value, groups=groups)
@@ -247,8 +245,7 @@ def before_and_after(name: str, before: Design, after: Design) -> Comparison:
 
 def _of_one_fold(design: Design, name: str) -> bool:
     """True of an effect with an amplitude that only exposures of one fold show: others do not predict these."""
-    place = {int(i): k for k, i in enumerate(design.fit.model.free)}
-    at = [place[int(i)] for i in design.fit.model.positions(name) if int(i) in place]
+    at = design.columns_of(design.fit.model.positions(name))
     square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
     of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
     return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) == 1))

@@ -267,8 +267,23 @@ def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterat
     likely = [k for k, gain in enumerate(gains) if (square - gain) * errors < chi2 + ALIKE and gain > least]
     if likely:
         likely.sort(key=lambda k: -gains[k])
-        causes = "; or ".join(scored[k].words for k in likely[: thresholds.SHOWN])
+        shown = (scored[k] for k in likely[: thresholds.SHOWN])
+        causes = "; or ".join(item.single.worded(item.score) for item in shown)
         yield f"what was found explains no more than one number that the set states would, if it were {causes}"
+
+
+def beside_conditions(
+    first: State, state: State, remainder: Unexplained | None, conditions: Singles
+) -> Remainder:
+    """The end of a search, or the first state where a number that the set states explains more than names do."""
+    fits = first.evidence.result, state.evidence.result
+    stated = instead_of_names(conditions, *fits) if conditions.items else ""
+    if not stated:
+        return state, remainder
+    partial = () if remainder is None else remainder.parts
+    names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
+    text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
+    return back_to(first, state), Unexplained(first.evidence.table.p_global, text, (), parts=partial)
 
 
 def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -> str:

@@ -39,7 +39,6 @@ from walop_jax.diagnosis.readings import with_places, with_values
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
-from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
@@ -108,11 +107,6 @@ class Scored(NamedTuple):
         """The number of the set that it is."""
         assert self.single.stated is not None
         return self.single.stated
-
-    @property
-    def words(self) -> str:
-        """Itself in words, with its size."""
-        return self.single.worded(self.score)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -183,10 +177,9 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     likely = [item for item in clear if item.score.statistic - item.score.rank > least]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item.score, rival.score) for rival in likely)]
-    likely.sort(
-        key=lambda item: (item.score.rank, item.score.log_p)
-    )  # a mistake of one number before sixteen
-    causes = "; or for ".join(item.words for item in likely[: thresholds.SHOWN])
+    # A mistake of one number comes before one of sixteen.
+    likely.sort(key=lambda item: (item.score.rank, item.score.log_p))
+    causes = "; or for ".join(item.single.worded(item.score) for item in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(singles.testable))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
@@ -249,8 +242,7 @@ def _of_cameras(design: Design) -> Iterator[Single]:
     def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
-        column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
-        rows = design.stacked([-column[measured.used].reshape(-1, 1)])
+        rows = design.stacked([measured.derivative(cube)[:, None]])
         name = words.format(names[k])
         wording = functools.partial(_worded, f"{name} of", unit=unit)
         return Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)

@@ -32,6 +32,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -273,8 +274,7 @@ def _significant(finding: str, table: ScoreTable) -> Iterator[str]:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class _GroupScore:
+class _GroupScore(NamedTuple):
     """Squared residuals of a group of the data beside those of the rest.
 
     `ratio` is 1 where the group scatters as the rest does; `p_value` that of a ratio so far from 1, on either side.
