@@ -212,13 +212,12 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
     fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
         fits.append(refit_without(fits[-1], step.effect.name))
-    compared, before = [], start
+    in_order, before = [], start
     for step, result in zip(steps, reversed(fits), strict=True):
         after = end if result is end.fit else Design.of(result)
-        changed = before_and_after(step.effect.name, before, after)
-        compared.append(dataclasses.replace(step, compared=changed))
+        in_order.append(dataclasses.replace(step, compared=before_and_after(step.effect.name, before, after)))
         before = after
-    return compared
+    return in_order
 
 
 LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]

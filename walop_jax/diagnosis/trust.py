@@ -212,10 +212,9 @@ def _summed_pixels(result: FitResult) -> Iterator[str]:
 
 def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
     """The structure of field points with that of the pixels that they stand for."""
-    compression = result.calset.compression
-    gain, response = (
-        (0.0, 0.0) if compression is None else (compression.gain or 0.0, compression.response or 0.0)
-    )
+    if (compression := result.calset.compression) is None:
+        return structure
+    gain, response = compression.gain or 0.0, compression.response or 0.0
     return Structure(float(np.hypot(structure.gain, gain)), float(np.hypot(structure.response, response)))
 
 
