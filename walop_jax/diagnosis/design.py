@@ -36,7 +36,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -324,10 +324,10 @@ class Design:
         fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
         return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
-    def columns_of(self, positions: Iterable[int]) -> Int[np.ndarray, " a"]:
+    def columns_of(self, positions: Int[np.ndarray, " _"] | Sequence[int]) -> Int[np.ndarray, " a"]:
         """Columns of the Jacobian that belong to parameters at some positions, as far as these are free."""
-        place = {int(i): k for k, i in enumerate(self.fit.model.free)}
-        return np.array([place[int(i)] for i in positions if int(i) in place], int)
+        place = {i: k for k, i in enumerate(self.fit.model.free.tolist())}
+        return np.array([place[i] for i in np.asarray(positions, int).tolist() if i in place], int)
 
     def without(self, at: Int[np.ndarray, " a"]) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
         """Projector off all parameters but some, and an orthonormal basis of the projected columns of these."""
