@@ -304,7 +304,7 @@ def test_a_number_that_explains_little_of_a_fit_far_off_is_not_told():
     assert result.noise_scale > 2.0
     design = Design.of(result)
     scores = Singles.of(design).testable
-    assert min(score.log_p for score in scores) < -20.0
+    assert min(item.score.log_p for item in scores) < -20.0
     assert not list(stated_conditions(design))
 
 
