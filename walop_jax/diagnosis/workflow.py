@@ -137,7 +137,7 @@ def diagnose(
 
 
 def _members(first: State, state: State, steps: Sequence[Step]) -> Classes:
-    """What the data cannot distinguish from the additions, and its effect on stars."""
+    """Candidates that the data cannot distinguish from the additions, and their effect on stars."""
     alike = dict[str, Collection[str]]()
     # Of a single group also what the final model cannot separate from it; of several that is of all together.
     for trial, step in zip(state.steps, steps, strict=True):
