@@ -12,7 +12,7 @@ from scenes import PLAN
 from walop_jax.diagnosis import remainder, thresholds
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.figure_data import figure_data
-from walop_jax.diagnosis.findings import Comparison
+from walop_jax.diagnosis.findings import FitComparison
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.search import State
@@ -136,7 +136,7 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
 @pytest.mark.parametrize(("left", "part"), [(24.0, True), (1.4, False)])
 def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_out(left, part):
     """χ²/dof 69 → 24 with the name is a part of what is missing; 69 → 1.4 is the cause of most of it."""
-    compared = Comparison(chi2_before=6900.0, chi2_after=100.0 * left)
+    compared = FitComparison(chi2_before=6900.0, chi2_after=100.0 * left)
     step = Trial(effect_by_name("flexure"), 1.0, 1.0, noise=False, compared=compared)
 
     def state(chi2, *steps):

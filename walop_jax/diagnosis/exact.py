@@ -30,7 +30,7 @@ from jaxtyping import Float
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.findings import Choice, Comparison
+from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, Vector, fit
@@ -68,7 +68,7 @@ class Trial:
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
     predicts: bool = True
-    compared: Comparison = dataclasses.field(default_factory=Comparison)
+    compared: FitComparison = dataclasses.field(default_factory=FitComparison)
     score: float = float("nan")
     p_value: float = float("nan")
     against: str = ""

@@ -144,7 +144,7 @@ Cube = Float[np.ndarray, "p e k"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class FitComparison:
     """Fits without and with an addition: χ², data left out of a fit, and what it changes.
 
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
@@ -175,7 +175,7 @@ class Comparison:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Step(Comparison):
+class Step(FitComparison):
     """One identified, added and confirmed effect; `parameters` hold (value, sigma, unit).
 
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.

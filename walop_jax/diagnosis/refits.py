@@ -24,7 +24,7 @@ from walop_jax.diagnosis.exact import (
     with_refuted_priors_widened,
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
-from walop_jax.diagnosis.findings import Choice, Comparison
+from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.diagnosis.search import State, names_first
@@ -223,13 +223,13 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
 LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 
-def before_and_after(name: str, before: Design, after: Design) -> Comparison:
+def before_and_after(name: str, before: Design, after: Design) -> FitComparison:
     """The fits without and with an effect."""
     effect = after.fit.model.template.effect(name)
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
     scheme = "field blocks" if many or _of_one_fold(after, name) else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
-    return Comparison(
+    return FitComparison(
         chi2_before=before.fit.chi2,
         chi2_after=after.fit.chi2,
         dof_after=after.fit.dof,
