@@ -41,7 +41,9 @@ def diagnosed() -> Diagnosis:
         after = after.doubted(Quality.CLASS_ONLY, sentence)
     residual = result.likelihood.residuals(result.values)[1]
     step = Step(
-        Described.name, {}, 0.0, 0.0, 0.0, 2.0, 1.0, 1, "exposures", 2.0, 1.0,
+        effect=Described.name, parameters={}, score=0.0, p_value=0.0, log_bayes=0.0,
+        chi2_before=2.0, chi2_after=1.0, dof_after=1,
+        heldout_scheme="exposures", heldout_before=2.0, heldout_after=1.0,
         equivalent=("crosstalk",), residual_before=residual, residual_after=residual,
     )  # fmt: skip
     return Diagnosis(

@@ -308,7 +308,7 @@ class Blind:
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
         names = [p for p in self.probes if p.effect.name not in removed]
         said, parts = grammar.beside_names(self.sentences, catalogue, self.context, self.template)
-        asked = [*(p.name for p in (*names, *said)), *(p.name for p, _ in parts), *self.patterns]
+        asked = [*(p.name for p in (*names, *said, *parts)), *self.patterns]
         space = self._behind_nuisance.subset(asked)
         if not removed:
             self._smallest = space.smallest_p(np.random.default_rng(7), DRAWS)

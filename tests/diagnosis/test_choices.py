@@ -16,7 +16,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives, changed
-from walop_jax.model.effects import Context, OtherDescription, effect_by_name
+from walop_jax.model.effects import OtherDescription, effect_by_name
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.ray import Conditions, Ray
 from walop_jax.model.specification import Model, effect_context, with_effects
@@ -76,10 +76,10 @@ def test_a_sentence_that_the_instrument_has_no_place_for_names_the_nearest(south
 def test_a_change_that_gained_nothing_is_not_compared_again(south, monkeypatch):
     """Once names have joined the model; one that did gain is, whatever its linear step leaves."""
     told: list[str] = []
-    monkeypatch.setattr(exact, "_screened", lambda result, asked, context: iter(()))
+    monkeypatch.setattr(exact, "_screened", lambda result, asked: iter(()))
     result = Mock(FitResult, model=Mock(Model, template=south, effect_names=()))
     earlier = {change: Choice(change, 2.0, -5.0) for change in alternatives(south)}
-    asked = result, Context(), lambda: True, told.append
+    asked = result, lambda: True, told.append
     assert other_descriptions(*asked, earlier=earlier) == ([], {})
     assert not told
     earlier |= {TURNED: Choice(TURNED, 2.0, 30.0), REVERSED: Choice(REVERSED, 0.5)}
@@ -104,8 +104,7 @@ def fitted(plan, change: str, seed: int = 5) -> FitResult:
 
 def best_of(result: FitResult) -> Choice | None:
     """The change that gains most in χ²."""
-    context = effect_context(result.model.template, result.calset.exposures)
-    trials, tried = other_descriptions(result, context, lambda: True, lambda text: None)
+    trials, tried = other_descriptions(result, lambda: True, lambda text: None)
     assert all(trial.instance.change in tried for trial in trials)
     fitted_ones = [one for one in tried.values() if np.isfinite(one.better_by)]
     return max(fitted_ones, key=lambda one: one.better_by, default=None)

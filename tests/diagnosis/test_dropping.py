@@ -12,13 +12,14 @@ from scenes import PLAN
 from walop_jax.diagnosis import remainder, thresholds
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.figure_data import figure_data
+from walop_jax.diagnosis.findings import FitComparison
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.search import State
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, FreeForm, effect_by_name
+from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.specification import model_without
 from walop_jax.simulation.simulate import simulate
 
@@ -94,7 +95,7 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypat
 
 
 def test_when_time_or_fits_are_over_nothing_further_is_tried():
-    how = (Context(), Hypotheses(), np.random.default_rng(0), lambda text: None)
+    how = (Hypotheses(), np.random.default_rng(0), lambda text: None)
     assert Refits(*how, minutes=0.0).over(0) == "0 minutes"
     assert Refits(*how).over(thresholds.MOST_FITS) == f"{thresholds.MOST_FITS} fits"
     assert Refits(*how).over(0) == ""
@@ -135,7 +136,7 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
 @pytest.mark.parametrize(("left", "part"), [(24.0, True), (1.4, False)])
 def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_out(left, part):
     """χ²/dof 69 → 24 with the name is a part of what is missing; 69 → 1.4 is the cause of most of it."""
-    compared = {"chi2_before": 6900.0, "chi2_after": 100.0 * left}
+    compared = FitComparison(chi2_before=6900.0, chi2_after=100.0 * left)
     step = Trial(effect_by_name("flexure"), 1.0, 1.0, noise=False, compared=compared)
 
     def state(chi2, *steps):

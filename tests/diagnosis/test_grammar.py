@@ -142,8 +142,8 @@ def test_parts_of_effects_stand_for_them(laid):
     context = effect_context(template, laid.calset.exposures)
     every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
     found = {
-        p.name: {e.name for e in effects}
-        for p, effects in grammar.beside_names(every, EFFECTS, context, template)[1]
+        p.name: {e.name for e in p.holders}
+        for p in grammar.beside_names(every, EFFECTS, context, template)[1]
     }
     assert found["light in O1"] == {"pedestal"}
     patches = [name for name in found if name.startswith("polarisation q of sky * exposure")]

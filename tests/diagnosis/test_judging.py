@@ -80,7 +80,7 @@ def test_signature_is_what_taking_the_effect_away_does(leaking):
     kept = [extended.model.index(name) for name in base.model.names]
     column = own_columns(bare, extended.values[kept], probe)[:, 0]
     share, _ = extended.value("camera_leakage.share")
-    found = exact.signature(extended, "camera_leakage", context)
+    found = exact.signature(extended, "camera_leakage")
     np.testing.assert_allclose(found, -column * share, atol=2e-2 * np.abs(found).max())
 
 
@@ -117,7 +117,7 @@ def test_robust_errors_are_the_stated_ones_when_noise_is_as_stated(leaking):
 def test_robust_errors_see_disturbances_of_whole_exposures(leaking):
     """Each exposure pulls the magnification by five times what noise lets it."""
     design = Design.of(leaking[-1])
-    column = design.without("pupil")[1][: design.rows, 0]
+    column = design.without(design.columns_of(design.fit.model.positions("pupil")))[1][: design.rows, 0]
     length = np.sqrt(np.bincount(design.exposure, column**2))
     pull = 5.0 * np.random.default_rng(4).choice([-1.0, 1.0], length.size) / length
     disturbed = design.residual.copy()

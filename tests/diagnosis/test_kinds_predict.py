@@ -92,14 +92,14 @@ def test_an_effect_of_single_exposures_is_held_against_places_in_the_field():
     before = fit(Likelihood.of(calset, base_model(calset)))
     model = with_effects(before.model, [patches], SMALL.context())
     found = before_and_after("moon_patch", Design.of(before), Design.of(fit(Likelihood.of(calset, model))))
-    assert found["heldout_scheme"] == "field blocks"
-    assert found["heldout_after"] < found["heldout_before"]
+    assert found.heldout_scheme == "field blocks"
+    assert found.confirmed
     model = with_effects(
         before.model, ["moon_multiple_scattering"], SMALL.context()
     )  # one number of all patches
     other = fit(Likelihood.of(calset, model))
     found = before_and_after("moon_multiple_scattering", Design.of(before), Design.of(other))
-    assert found["heldout_scheme"] == "exposures"
+    assert found.heldout_scheme == "exposures"
 
 
 def test_patches_of_the_moon_are_named_though_no_exposure_predicts_another():

@@ -15,7 +15,6 @@ from walop_jax.diagnosis.refits import settled
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.model.cameras import Transmission
 from walop_jax.model.effects import Described, Effect
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
 
@@ -94,8 +93,7 @@ def test_a_further_sentence_leaves_the_priors_of_those_before():
     label = f"described.{first.replace(' ', '_')}"
     mean, width = alone.model[label].prior
     assert width > 2e-2
-    context = effect_context(alone.model.template, calset.exposures)
-    trial = try_effect(alone, Described.saying([second], [0.0]), context)
+    trial = try_effect(alone, Described.saying([second], [0.0]))
     assert trial.fit.model[label].prior == (mean, width)
     # A prior of 0.3 % would pull at 2.4 %: by (8² − 1)/2 in ln B.
     assert trial.fit.chi2 / trial.fit.dof < 1.15

@@ -25,7 +25,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import with_places
-from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
+from walop_jax.diagnosis.remainder import instead_of_names, rival_conditions
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
@@ -143,7 +143,7 @@ def test_a_share_of_the_sky_that_is_left_is_told_with_its_size():
     assert error < 0.001
     sound = refit(under_sky(plain, 0.0))
     (score,) = [
-        one.score for one in condition_scores(Design.of(sound)) if "light of the sky" in one.stated.what
+        one.score for one in condition_scores(Design.of(sound)).items if "light of the sky" in one.stated.what
     ]
     assert abs(score.amplitudes[0]) < 3 * np.sqrt(score.covariance[0, 0])
     assert examined(sound).trusted
@@ -286,7 +286,7 @@ def test_the_score_is_what_a_fit_gains_that_knows_better():
     calset = simulate(SMALL, seed=SEED).calset
     wrong, right = refit(displaced(calset)), refit(calset)
     scored = condition_scores(Design.of(wrong))
-    score = next(item.score for one, item in scored if one.what.startswith("X of all field points"))
+    score = next(item.score for item in scored.items if item.stated.what.startswith("X of all field points"))
     away = float(score.amplitudes[0]) - -0.02
     expected = score.statistic - away**2 / score.covariance[0, 0]
     assert wrong.chi2 - right.chi2 == pytest.approx(expected, rel=0.1)
@@ -301,7 +301,7 @@ def test_a_number_that_explains_little_of_a_fit_far_off_is_not_told():
     assert result.noise_scale > 2.0
     design = Design.of(result)
     scores = Singles.of(design).testable
-    assert min(score.log_p for score in scores) < -20.0
+    assert min(item.score.log_p for item in scores) < -20.0
     assert not list(stated_conditions(design))
 
 
@@ -336,10 +336,10 @@ def test_at_its_limit_a_number_is_found_as_often_as_promised():
     noise[:rows] = rng.standard_normal((rows, noise.shape[1]))
     checked = 0
     scored = condition_scores(design)
-    tried = sum(item.score.testable for _, item in scored)
+    tried = len(scored.testable)
     least = 1.0 - (1.0 - 0.0027) ** (1.0 / tried)
-    for stated, item in scored:
-        limit = limits[stated.what]
+    for item in scored.items:
+        limit = limits[item.stated.what]
         if not item.score.testable:
             continue
         left = design.projector(item.single.candidate.columns[:, 0])

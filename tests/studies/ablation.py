@@ -48,6 +48,7 @@ from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.diagnosis import exact, examination, refits, remainder, search, thresholds, workflow  # noqa: E402
 from walop_jax.diagnosis.design import Design  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
+from walop_jax.diagnosis.findings import FitComparison  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Ranked  # noqa: E402
 from walop_jax.diagnosis.refits import Refits  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
@@ -112,7 +113,8 @@ RULES = (
     Rule("a description predicts states and cells by its linear step, to be fitted (`_hopeful`)",
          ((Refits, "_hopeful"),), always(True), refuses),
     Rule("data that were left out agree better with an addition",
-         REFUSED, lambda real: lambda evidence, trial: real(evidence, dataclasses.replace(trial, compared={})),
+         REFUSED,
+         lambda real: lambda evidence, trial: real(evidence, dataclasses.replace(trial, compared=FitComparison())),
          _of("data that were left out")),
     Rule("no KIND contradicts an addition, nor all of them (`contradicting`)",
          ((refits, "contradicting"), (remainder, "contradicting")), always(""), answers),
@@ -139,11 +141,11 @@ RULES = (
          lambda args, answer: sum(len(step.groups) for step in args[1].steps) > thresholds.MOST_SENTENCES,
          ((remainder, "concluded"), (workflow, "concluded"))),
     Rule("one number that the set states, instead of names (`instead_of_names`)",
-         ((workflow, "instead_of_names"),), always(""), answers),
+         ((remainder, "instead_of_names"),), always(""), answers),
     Rule("another reading of the data is asked (`mixups_of`)", ((workflow, "mixups_of"),), always(()), answers),
 )  # fmt: skip
 OF_LINEAR_STEPS = RULES[:6]
-INSTEAD = workflow.instead_of_names
+INSTEAD = remainder.instead_of_names
 WORTH = {"right": 2, "in its class": 2, "class": 2, "open": 1, "not detected": 1, "": 1, "wrong": 0}
 
 
@@ -362,7 +364,7 @@ def fitted(one: Sealed, before: list[Any]) -> Fitted:
             before[0]
             and end[0] is before[0][0]
             and end[1:] == before[0][1:]
-            and workflow.instead_of_names is instead
+            and remainder.instead_of_names is instead
         ):
             raise Same
         return state, rest

@@ -448,7 +448,7 @@ def named(found: Candidates, standard, plan: ObservingPlan, pair: tuple[str, str
         simulated.calset,
         base_model(simulated.calset, whole.design, throughput_degree=whole.throughput_degree),
     )
-    own, rival = (try_effect(base, effect, context).evidence for effect in effects)
+    own, rival = (try_effect(base, effect).evidence for effect in effects)
     return bool(own - rival > thresholds.IMPROBABLE)
 
 

@@ -31,18 +31,16 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct, sentences_in
-from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, signature
+from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import sentences_of
-from walop_jax.diagnosis.score import FAINTEST, Matrix, Projector, Vector, log_bayes
+from walop_jax.diagnosis.score import FAINTEST, Matrix, Vector, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE
-from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.specification import effect_context
 
 ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
@@ -59,30 +57,23 @@ def classes_of(
     it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are sentences that
     the model had before.
     """
-    return tuple(group for group in _classes(laid, added, given) if group.names)
-
-
-def _classes(laid: Laid, added: Mapping[str, Collection[str]], given: Collection[str]) -> Iterator[ClassOf]:
-    fit, model = laid.fit, laid.fit.model
-    groups = [name for name in added if name not in model.effect_names]
-    place = {int(i): k for k, i in enumerate(model.free)}
-    slope: Matrix | None = None
+    fit, model, design = laid.fit, laid.fit.model, laid.design
+    groups, classes = [name for name in added if name not in model.effect_names], list[ClassOf]()
     for effect in model.effects:
-        if effect.name in added and not effect.kind.is_structural():
-            at = [place[i] for i in model.positions(effect.name).tolist() if i in place]
-            if at:
-                change = signature(fit, effect.name, laid.context)
-                sums = tuple(map(tuple, effect.first_order(model.template)))
-                yield laid.class_of(effect.name, np.array(at), change, sums, added[effect.name])
+        at = design.columns_of(model.positions(effect.name))
+        if effect.name in added and not effect.kind.is_structural() and len(at):
+            change, sums = signature(fit, effect.name), tuple(map(tuple, effect.first_order(model.template)))
+            classes.append(laid.class_of(effect.name, at, change, sums, added[effect.name]))
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
-            indices = [model.index(f"{Described.name}.{Sentence.parsed(text).label}") for text in group]
-            at = [place[i] for i in indices if i in place]
-            if not at:
-                continue
-            slope = fit.likelihood.jacobian(fit.values) / fit.noise_scale if slope is None else slope
-            change = -slope[:, at] @ fit.values[model.free[at]]
-            sums = tuple(((1.0, Sentence.parsed(text)),) for text in group)
-            yield laid.class_of("; ".join(group), np.array(at), change, sums, added.get(name, ()))
+            sentences = [Sentence.parsed(text) for text in group]
+            at = design.columns_of(
+                [model.index(f"{Described.name}.{sentence.label}") for sentence in sentences]
+            )
+            if len(at):
+                change = -design.jacobian[: design.rows, at] @ fit.values[model.free[at]]
+                sums = tuple(((1.0, sentence),) for sentence in sentences)
+                classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ())))
+    return tuple(group for group in classes if group.names)
 
 
 def _groups(
@@ -108,7 +99,6 @@ class Laid:
         self.state, self.fit, self.design = state, state.result, state.design
         calset, model = self.fit.calset, self.fit.model
         self.template = model.template
-        self.context = effect_context(self.template, calset.exposures)
         self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
         self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
@@ -222,8 +212,7 @@ class LinearStep:
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
         self.rest = np.delete(np.arange(design.jacobian.shape[1]), at)
-        others = design.jacobian[:, self.rest]
-        self.projector = Projector(others, design.eliminated) if len(at) else design.projector
+        self.projector, self.basis = design.without(at)
         self.left = self.projector(design.residual + self.lost)
 
     def addition(self, name: str, sums: tuple[Sum, ...]) -> tuple[Likeness, Vector]:
@@ -247,10 +236,7 @@ class LinearStep:
         group that was added, sentences that nothing shows were dropped since: the group is compared with other groups.
         """
         state, design, texts = self.laid.state, self.laid.design, _texts(addition.sums)
-        projected = self.projector(design.jacobian[:, self.at])
-        basis = projected @ whitening(projected.T @ projected)
-        along = design.products(state.columns, basis)
-        gram, scores = state.bare.gram + along @ along.T, design.products(state.columns, self.left)
+        gram, scores = state.space_beside(self.basis)[1].gram, design.products(state.columns, self.left)
         places, scored = state.bare.places(), []
         for probe in state.asked:
             at = places[probe.name]
@@ -316,7 +302,9 @@ class LinearStep:
             return None
         column = design.stacked([self.laid.columns.of(sums)])
         if widths is None:
-            widths = np.array([amplitude[0][1].width(self.laid.context.largest) for amplitude in sums])
+            widths = np.array(
+                [amplitude[0][1].width(context_of(self.laid.fit).largest) for amplitude in sums]
+            )
         name = "; ".join(sentence.text for sentence in sentences_in(sums))
         twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.

@@ -92,8 +92,12 @@ class Measured:
 
     def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
-        change = self.flux[..., None] * pattern * self.level[:, None, :] * self.weight
-        return -project_flux(change, self.model, self.known, self.shared)[self.used].reshape(-1)
+        return self.derivative(self.flux[..., None] * pattern * self.level[:, None, :])
+
+    def derivative(self, change: Cube) -> Float[np.ndarray, " _"]:
+        """Derivative of the residuals with respect to the amplitude of N_k → N_k + change."""
+        projected = project_flux(change * self.weight, self.model, self.known, self.shared)
+        return -projected[self.used].reshape(-1)
 
     @property
     def has_gains(self) -> bool:
@@ -320,15 +324,17 @@ class Design:
         fitted = determined(self.jacobian.T @ self.jacobian, likelihood.weak)
         return fluxes + int((~likelihood.priors.known).sum()) - (len(likelihood.weak) - round(fitted))
 
-    def _columns_of(self, name: str) -> Bool[np.ndarray, " f"]:
-        """True for the columns of the Jacobian that belong to an effect."""
-        return np.isin(self.fit.model.free, self.fit.model.positions(name))
+    def columns_of(self, positions: Int[np.ndarray, " _"] | Sequence[int]) -> Int[np.ndarray, " a"]:
+        """Columns of the Jacobian that belong to parameters at some positions, as far as these are free."""
+        place = {i: k for k, i in enumerate(self.fit.model.free.tolist())}
+        return np.array([place[i] for i in np.asarray(positions, int).tolist() if i in place], int)
 
-    def without(self, name: str) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
-        """Projector off all parameters but those of one effect, and an orthonormal basis of its projected columns."""
-        of_effect = self._columns_of(name)
-        projector = Projector(self.jacobian[:, ~of_effect], self.eliminated)
-        projected = projector(self.jacobian[:, of_effect])
+    def without(self, at: Int[np.ndarray, " a"]) -> tuple[Projector, Float[np.ndarray, "_ _"]]:
+        """Projector off all parameters but some, and an orthonormal basis of the projected columns of these."""
+        if not len(at):
+            return self.projector, np.zeros((len(self.residual), 0))
+        projector = Projector(np.delete(self.jacobian, at, axis=1), self.eliminated)
+        projected = projector(self.jacobian[:, at])
         return projector, projected @ whitening(projected.T @ projected)
 
     def stacked(self, columns: Sequence[Float[np.ndarray, "_ _"]]) -> Float[np.ndarray, "_ _"]:
@@ -349,17 +355,6 @@ class Design:
         cube[used] = rows[: self.rows].reshape(-1, self.measured.cameras)
         return cube
 
-    def subset_step(self, keep: Bool[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
-        """Change of the free parameters when only the data rows in `keep` (and the priors) are fitted.
-
-        One Gauss–Newton step from the joint minimum: the change is a fraction of the standard errors, where the
-        model is linear to better than that fraction squared.
-        """
-        rows = np.concatenate([keep, np.ones(len(self.residual) - self.rows, bool)])
-        unit, norm = unit_columns(self.jacobian)
-        scaled, r = unit[rows], self.residual[rows]
-        return -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
-
     def robust_ratio(self, name: str) -> float:
         """Largest ratio of robust to stated errors among the parameters of an effect; NaN when it has none.
 
@@ -367,7 +362,7 @@ class Design:
         H = JᵀJ and g_e the gradient of exposure e (White 1982, Econometrica 50, 1; Liang & Zeger 1986, Biometrika 73,
         13).
         """
-        at = np.flatnonzero(self._columns_of(name))
+        at = self.columns_of(self.fit.model.positions(name))
         if not len(at):
             return float("nan")
         scaled, _ = unit_columns(self.jacobian)
@@ -400,14 +395,17 @@ def field_folds(design: Design) -> Int[np.ndarray, " d"]:
 def held_out(design: Design, scheme: str) -> float:
     """Mean squared normalised residual on data that took no part in a fit: each fold is predicted by the others.
 
-    Noise alone gives 1 − 1/K with K cameras when the flux is free.
+    These, and the priors, move the free parameters by one Gauss–Newton step from the joint minimum: a fraction of the
+    standard errors, where the model is linear to better than that fraction squared. Noise alone gives 1 − 1/K with K
+    cameras when the flux is free.
     """
     fold = {"exposures": exposure_folds, "field blocks": field_folds}[scheme](design)
-    squares = np.zeros(HOLDOUT_FOLDS)
+    squares, (unit, norm) = np.zeros(HOLDOUT_FOLDS), unit_columns(design.jacobian)
     for k in np.unique(fold):
-        out = fold == k
-        rows = np.flatnonzero(out)
-        predicted = design.residual[rows] + design.jacobian[rows] @ design.subset_step(~out)
+        rows = np.flatnonzero(fold == k)
+        scaled, r = np.delete(unit, rows, axis=0), np.delete(design.residual, rows)
+        step = -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
+        predicted = design.residual[rows] + design.jacobian[rows] @ step
         squares[k] = predicted @ predicted * design.fit.noise_scale**2
     return float(squares.sum() / len(fold))
 

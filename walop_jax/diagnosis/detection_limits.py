@@ -472,20 +472,20 @@ def _collected(
 def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     """A limit for every stated condition of the set behind a fit."""
     scored = condition_scores(design)
-    tried = sum(item.score.testable for _, item in scored)
+    tried = len(scored.testable)
     if not tried:
         return ()
     result = design.fit
     instrument, calset = result.model.instrument(result.values), result.calset
     setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
     matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
-    columns = np.column_stack([item.single.candidate.columns[:, 0] for _, item in scored])
+    columns = np.column_stack([item.single.candidate.columns[:, 0] for item in scored.items])
     taken_up = design.projector.taken_up(design.projector.basis.T @ columns)
     off = slopes @ (result.model.selection() @ taken_up)
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
     limits = []
-    for number, (stated, item) in enumerate(scored):
-        slope = off[..., number]
+    for number, item in enumerate(scored.items):
+        stated, slope = item.stated, off[..., number]
         if stated.seen_by_stars:
             step = STEP * stated.width
             above, below = (

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, Vector, fit
@@ -46,10 +47,11 @@ from walop_jax.model.specification import Model, effect_context, model_without, 
 class Trial:
     """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
-    `item` is its linear step, `linear` the evidence of that (NaN where there was none). `fit` is None until it has been
+    `item` is its linear step, `linear` the evidence of that (NaN where there was none), `score` and `p_value` are those
+    of the linear test when it was added. `fit` is None until it has been
     fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
     evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
-    where its linear step does not predict held-out data, `compared` holds the comparison of two fits
+    where its linear step does not predict held-out data, `compared` are the fits without and with it
     (`refits.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
     which it was not added, `groups` the groups of sentences that were added one after the other, each with the
     candidates that were as good then.
@@ -66,7 +68,9 @@ class Trial:
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
     predicts: bool = True
-    compared: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    compared: FitComparison = dataclasses.field(default_factory=FitComparison)
+    score: float = float("nan")
+    p_value: float = float("nan")
     against: str = ""
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
@@ -130,15 +134,15 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
     return log_bayes(information - np.diag(width**-2.0), scores, width, scales)
 
 
-def try_effect(base: FitResult, instance: Effect, context: Context, prior_shapes: int = 1) -> Trial:
+def try_effect(base: FitResult, instance: Effect, prior_shapes: int = 1) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again.
 
     Sentences join those that the model has. It shares the prior of one name with all of its `prior_shapes`.
     """
     if isinstance(instance, Described):
-        model = with_sentences(base.model, instance, context)
+        model = with_sentences(base.model, instance, base.calset)
     else:
-        model = with_effects(base.model, [instance], context)
+        model = with_effects(base.model, [instance], base.calset)
     return _try_model(base, instance.kind, model, base.values, prior_shapes)
 
 
@@ -160,11 +164,11 @@ def _try_model(
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 
-def try_shapes(base: FitResult, item: Ranked, context: Context, shapes: int) -> Trial:
+def try_shapes(base: FitResult, item: Ranked, shapes: int) -> Trial:
     """Refit an effect from the amplitudes of its linear steps at the shapes that may be best, and keep the best."""
     places = ((item.probe, item.score), *item.others)
     steps = (item.effect.combine(probe.group, score.amplitudes) for probe, score in places)
-    trials = [try_effect(base, step, context, shapes) for step in steps]
+    trials = [try_effect(base, step, shapes) for step in steps]
     converged = [t for t in trials if t.fit is not None and t.fit.converged]
     best = max(converged or trials[:1], key=lambda t: t.evidence)
     alike = [t for t in converged if t.evidence > best.evidence - thresholds.EVEN_ODDS]
@@ -219,8 +223,7 @@ def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], n
 def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
     """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
     effect = result.model.template.effect(name)
-    context = effect_context(result.model.template, result.calset.exposures)
-    expected, far = effect.prior_widths(context), {}
+    expected, far = effect.prior_widths(context_of(result)), {}
     for i in amplitude_positions(result.model, name):
         p = result.model.parameters[i]
         label = p.name.removeprefix(f"{name}.")
@@ -228,6 +231,11 @@ def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
         if widths > PRIOR_EDGE:
             far[label] = widths
     return far
+
+
+def context_of(result: FitResult) -> Context:
+    """Facts about the data of a fit, for effects."""
+    return effect_context(result.model.template, result.calset.exposures)
 
 
 def evidence_of_presence(result: FitResult, name: str) -> float:
@@ -252,7 +260,7 @@ def _bare(result: FitResult, name: str) -> tuple[Likelihood, Vector]:
     return Likelihood.of(result.calset, model), result.values[at]
 
 
-def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarray, " _"]:
+def signature(result: FitResult, name: str) -> Float[np.ndarray, " _"]:
     """Change of the residuals (data rows) by an active effect: theirs without it, minus theirs with it."""
     effect = result.model.template.effect(name)
     if effect.kind.is_structural():
@@ -260,7 +268,7 @@ def signature(result: FitResult, name: str, context: Context) -> Float[np.ndarra
         bare = likelihood.residuals(values)[1]
     else:
         values = result.values.copy()
-        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context)))
+        values[result.model.positions(name)] = np.asarray(values_of(effect.at_neutral(context_of(result))))
         bare = result.likelihood.residuals(values)[1]
     change = bare - result.likelihood.residuals(result.values)[1]
     return change[result.likelihood.used].reshape(-1) / result.noise_scale
@@ -272,19 +280,18 @@ CHOICE_ROWS = 6000
 NO_DIFFERENCE = 1e-6  # smallest change of the residuals, in standard deviations
 
 
-def described_otherwise(model: Model, sentence: str, context: Context) -> Model:
+def described_otherwise(model: Model, sentence: str, calset: CalibrationSet) -> Model:
     """The model with the change of a sentence applied to its instrument, after all earlier changes."""
     name = OtherDescription.name
     if name in model.effect_names:
         before = model.template.effect(name)
         assert isinstance(before, OtherDescription)
         sentence, model = f"{before.change}{JOINED}{sentence}", model_without(model, name)
-    return with_effects(model, [OtherDescription(change=sentence)], context)
+    return with_effects(model, [OtherDescription(change=sentence)], calset)
 
 
 def other_descriptions(
     result: FitResult,
-    context: Context,
     fits: Callable[[], bool],
     tell: Callable[[str], None],
     *,
@@ -308,7 +315,7 @@ def other_descriptions(
         return [], {}
     tell(f"comparing {len(asked)} other descriptions")
     candidates = itertools.takewhile(lambda _: fits(), asked)
-    screened = sorted(_screened(result, candidates, context), key=lambda item: item[0].left)
+    screened = sorted(_screened(result, candidates), key=lambda item: item[0].left)
     compared, trials = {choice.change: choice for choice, _, _ in screened}, []
     best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]
     chosen = {choice.change for choice, _, _ in best}
@@ -317,7 +324,7 @@ def other_descriptions(
         if not fits():
             break
         tell(f"trying another description: {choice.change}")
-        model = described_otherwise(result.model, choice.change, context)
+        model = described_otherwise(result.model, choice.change, result.calset)
         try:
             trial = _try_model(result, OtherDescription, model, start, len(sentences))
         except ValueError:  # a free parameter of a removed element has no prior and is undetermined
@@ -329,9 +336,7 @@ def other_descriptions(
     return trials, compared
 
 
-def _screened(
-    result: FitResult, sentences: Iterable[str], context: Context
-) -> Iterator[tuple[Choice, float, Vector]]:
+def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Choice, float, Vector]]:
     """Every effective change with its residual fraction, gain in χ² and starting values: the better of two."""
     point_limit = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, point_limit, neighbours=1)
@@ -344,7 +349,7 @@ def _screened(
     reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
         try:
-            model = described_otherwise(result.model, sentence, context)
+            model = described_otherwise(result.model, sentence, calset)
         except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
             continue
         changed, ratios = Likelihood.of(calset, model), []

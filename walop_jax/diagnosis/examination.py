@@ -41,8 +41,6 @@ from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.instrument import Instrument
 
-Parts = Sequence[tuple[Probe, Collection[EffectKind]]]
-
 
 def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
     """Effects by evidence, best first; alternative shapes share the prior of their effect."""
@@ -50,7 +48,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
     for probe in probes:
         by_effect.setdefault(probe.effect, []).append((probe, table[probe.name]))
     ranked = []
-    for effect, shapes in by_effect.items():
+    for shapes in by_effect.values():
         alive = [(p, s) for p, s in shapes if s.testable and follow_physics(p, s.amplitudes, s.covariance)]
         if not alive:
             continue
@@ -59,7 +57,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
         least = best - max(thresholds.WITHIN, 0.2 * best)
         alternatives = [item for item in alive[1 : thresholds.MOST_FITTED] if item[1].log_bayes > least]
-        ranked.append(Ranked(effect, probe, score, mean, tuple(alternatives)))
+        ranked.append(Ranked(probe, score, mean, tuple(alternatives)))
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
@@ -117,7 +115,7 @@ class Evidence:
     table: ScoreTable
     probes: Sequence[Probe]
     sentences: Sequence[Probe]
-    parts: Parts
+    parts: Sequence[Probe]
     patterns: Sequence[str]
     chi2: float
     dof: int
@@ -126,7 +124,7 @@ class Evidence:
     @property
     def asked(self) -> tuple[Probe, ...]:
         """All candidates but patterns."""
-        return (*self.probes, *self.sentences, *(probe for probe, _ in self.parts))
+        return (*self.probes, *self.sentences, *self.parts)
 
     @cached_property
     def ranked(self) -> list[Ranked]:
@@ -138,7 +136,7 @@ class Evidence:
         """Sentences in order of evidence, each less the logarithm of their number."""
         price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
-        candidates = (Ranked(Described, p, s, s.log_bayes - price) for p, s in scored if s.testable)
+        candidates = (Ranked(p, s, s.log_bayes - price) for p, s in scored if s.testable)
         return sorted(candidates, key=lambda item: -item.log_bayes)
 
     def is_clear(self, score: Score) -> bool:
@@ -263,9 +261,9 @@ class Evidence:
 
     def held_in_part(self, item: Ranked) -> tuple[str, ...]:
         """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
-        count = collections.Counter(effect for _, effects in self.parts for effect in effects)
+        count = collections.Counter(effect for probe in self.parts for effect in probe.holders)
         least = max(0.0, item.log_bayes - thresholds.IMPROBABLE)
-        scored = ((self.table[probe.name], effect) for probe, effects in self.parts for effect in effects)
+        scored = ((self.table[probe.name], effect) for probe in self.parts for effect in probe.holders)
         likely = (
             effect.name
             for score, effect in scored
@@ -354,13 +352,17 @@ class Examination(Evidence):
             effect.name for effect in catalogue if effect.name not in testable and not effect.is_structural()
         )
 
+    def space_beside(self, basis: Matrix) -> tuple[Matrix, ScoreSpace]:
+        """Products of all columns with a basis of parameters that are taken out (`Design.without`); the space then."""
+        along = self.design.products(self.columns, basis)
+        return along, dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
+
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
         design, columns = self.design, self.columns
-        rest, basis = design.without(name)
-        along = design.products(columns, basis)
+        rest, basis = design.without(design.columns_of(self.result.model.positions(name)))
+        along, space = self.space_beside(basis)
         projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
-        space = dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
         scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)
         distances = self.nearest(separations(space, scores, float(projected @ projected)))
         return {rival: apart / self.floor for rival, apart in distances.items()}
@@ -388,13 +390,16 @@ def examine(
         computed = all_candidates(design.columns, hypotheses.beside(active))
     probes = [p for p in hypotheses.names if p.name in computed and p.effect.name not in active]
     sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
-    holders = [(p, {kind for kind in kinds if kind.name not in active}) for p, kinds in hypotheses.parts]
-    parts = [(probe, kinds) for probe, kinds in holders if probe.name in computed]
+    parts = [
+        dataclasses.replace(p, holders=frozenset(kind for kind in p.holders if kind.name not in active))
+        for p in hypotheses.parts
+        if p.name in computed
+    ]
     patterns = [
         dataclasses.replace(item, columns=item.columns.astype(np.float32))
         for item in map(design.measured.candidate, strata(design.measured))
     ]
-    of_probes = [computed[probe.name] for probe in (*probes, *sentences, *(probe for probe, _ in parts))]
+    of_probes = [computed[probe.name] for probe in (*probes, *sentences, *parts)]
     candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
     names = list(candidates)
     widths, columns = zip(*((c.widths, c.columns) for c in candidates.values()), strict=True)

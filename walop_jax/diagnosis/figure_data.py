@@ -203,15 +203,10 @@ def _figure_data(tables: Mapping[str, Mapping[str, Any]]) -> DiagnosisFigureData
         rows = tables[name]["COMPARISON"] == number
         return {key: tables[name][key][rows] for key, (rule, _) in _TABLES[name].items() if rule is _CAMERAS}
 
+    rows = zip(*(about[name].tolist() for name in _TABLES["COMPARISONS"]), strict=True)
     comparisons = [
-        ResidualComparison(
-            effect=str(about["EFFECT"][number]),
-            combination=str(about["COMBINATION"][number]),
-            harmonic=int(about["HARMONIC"][number]),
-            field=of_number("FIELD", number),
-            curves=of_number("CURVES", number),
-        )
-        for number in about["COMPARISON"].tolist()
+        ResidualComparison(effect, combination, harmonic, of_number("FIELD", i), of_number("CURVES", i))
+        for i, effect, combination, harmonic in rows
     ]
     first, rows = field["COMPARISON"] == 0, curves["COMPARISON"] == 0
     return DiagnosisFigureData(

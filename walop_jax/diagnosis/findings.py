@@ -144,20 +144,47 @@ Cube = Float[np.ndarray, "p e k"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class FitComparison:
+    """Fits without and with an addition: χ², data left out of a fit, and what it changes.
+
+    `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
+    point. `residual_before` and `residual_after` are the residuals (data − model, in standard deviations as given;
+    point, exposure, camera) at the time it was added; where another name has been dropped since, they and χ² are of
+    fits without that name.
+    """
+
+    chi2_before: float = float("nan")
+    chi2_after: float = float("nan")
+    dof_after: int = 0
+    heldout_scheme: str = ""
+    heldout_before: float = float("nan")
+    heldout_after: float = float("nan")
+    change_of_qu: float = float("nan")
+    residual_before: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+    residual_after: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+
+    @property
+    def confirmed(self) -> bool:
+        """True if held-out data agree better with the addition than without."""
+        return self.heldout_after < self.heldout_before
+
+    @property
+    def negligible(self) -> bool:
+        """True if it is negligible for calibrated q and u."""
+        return self.change_of_qu < thresholds.NEGLIGIBLE
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Step(FitComparison):
     """One identified, added and confirmed effect; `parameters` hold (value, sigma, unit).
 
     `score` and `p_value` (corrected for all that was tried) are of the linear test, `log_bayes` of the refit.
     `far` are amplitudes that lie beyond what their prior allows, in its widths: the data have refuted that prior.
-    `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
-    point, `robust_ratio` the errors of its parameters when every exposure may have a disturbance of its own, over
-    the errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same
-    effect that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set,
-    `separation` is the distance (σ) of each rival from it. `residual_before` and `residual_after` are the residuals
-    (data − model, in standard deviations as given; point, exposure, camera) without and with the effect at the time it
-    was added; where another name has been dropped since, they and χ² are of fits without that name. `descriptions` are
-    the sentences of an effect without a name (`described`) with amplitude and error, `nameless` those that are not
-    improbable in addition to what was found.
+    `robust_ratio` are the errors of its parameters when every exposure may have a disturbance of its own, over the
+    errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same effect
+    that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
+    is the distance (σ) of each rival from it. `descriptions` are the sentences of an effect without a name
+    (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
     """
 
     effect: str
@@ -165,13 +192,6 @@ class Step:
     score: float
     p_value: float
     log_bayes: float
-    chi2_before: float
-    chi2_after: float
-    dof_after: int
-    heldout_scheme: str
-    heldout_before: float
-    heldout_after: float
-    change_of_qu: float = float("nan")
     robust_ratio: float = float("nan")
     far: dict[str, float] = dataclasses.field(default_factory=dict)
     choices: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -182,18 +202,6 @@ class Step:
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
-    residual_before: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
-    residual_after: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
-
-    @property
-    def confirmed(self) -> bool:
-        """True if held-out data agree better with the effect than without."""
-        return self.heldout_after < self.heldout_before
-
-    @property
-    def negligible(self) -> bool:
-        """True if the effect is negligible for calibrated q and u."""
-        return self.change_of_qu < thresholds.NEGLIGIBLE
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,8 +73,8 @@ def hypotheses(
 
 def beside_names(
     all_probes: Sequence[Probe], catalogue: Sequence[EffectKind], context: Context, instrument: Instrument
-) -> tuple[list[Probe], list[tuple[Probe, frozenset[EffectKind]]]]:
-    """The groups that are no effect of a catalogue by another name: those that none holds, and parts, with the holders.
+) -> tuple[list[Probe], list[Probe]]:
+    """The groups that are no effect of a catalogue by another name: those that none holds, and parts of effects.
 
     A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.
     """
@@ -89,7 +89,7 @@ def beside_names(
         if any(texts == own for texts, _ in named):
             continue
         if holders:
-            partial.append((probe, holders))
+            partial.append(dataclasses.replace(probe, holders=holders))
         else:
             alone.append(probe)
     return alone, partial

@@ -32,13 +32,14 @@ FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what re
 class Probe:
     """One group of probes of an effect: the place in its shape space from which a linear step is taken.
 
-    `context` are the data that its prior widths are for.
+    `context` are the data that its prior widths are for, `holders` effects of which a group of sentences is a part.
     """
 
     name: str
     effect: EffectKind
     group: tuple[Effect, ...]
     context: Context = dataclasses.field(default_factory=Context)
+    holders: frozenset[EffectKind] = frozenset()
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -61,11 +62,15 @@ class Probe:
 class Ranked:
     """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good."""
 
-    effect: EffectKind
     probe: Probe
     score: Score
     log_bayes: float
     others: tuple[tuple[Probe, Score], ...] = ()
+
+    @property
+    def effect(self) -> EffectKind:
+        """The effect of its probe."""
+        return self.probe.effect
 
     @property
     def name(self) -> str:
@@ -76,20 +81,20 @@ class Ranked:
 class Hypotheses(NamedTuple):
     """All possible omissions of a model: probes of effects with a name, and sentences.
 
-    `sentences` are those that no effect holds, `parts` those that effects hold in part, with the holders. `effects` are
-    those that fit the instrument, `every` all sentences, those that are an effect by another name as well.
+    `sentences` are those that no effect holds, `parts` those that are a part of effects. `effects` are those that fit
+    the instrument, `every` all sentences, those that are an effect by another name as well.
     """
 
     names: Sequence[Probe] = ()
     sentences: Sequence[Probe] = ()
-    parts: Sequence[tuple[Probe, frozenset[EffectKind]]] = ()
+    parts: Sequence[Probe] = ()
     effects: tuple[EffectKind, ...] = ()
     every: Sequence[Probe] = ()
 
     def beside(self, effects: Collection[str]) -> tuple[Probe, ...]:
         """All candidates beside the effects that a model has."""
         absent = (probe for probe in self.names if probe.effect.name not in effects)
-        return (*absent, *self.sentences, *(probe for probe, _ in self.parts))
+        return (*absent, *self.sentences, *self.parts)
 
     @property
     def amplitudes(self) -> int:

@@ -348,7 +348,7 @@ def _orders(model: Model) -> Iterator[Alternative]:
         yield Alternative(
             f"the columns of N were in the order {held}",
             f"their order is {', '.join(names)}",
-            _with_cameras(list(order)),
+            _with_block(lambda b, at=list(order): {"counts": b.counts[..., at], "sigma": b.sigma[..., at]}),
         )
 
 
@@ -395,10 +395,6 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
                 "give degrees, or the unit of the columns",
                 with_places(lambda x, y, factor=factor: (factor * x, factor * y)),
             )
-
-
-def _with_cameras(order: list[int]) -> Change:
-    return _with_block(lambda b: {"counts": b.counts[..., order], "sigma": b.sigma[..., order]})
 
 
 def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, exposure_folds, held_out
 from walop_jax.diagnosis.exact import (
     Trial,
+    context_of,
     other_descriptions,
     refit_without,
     try_effect,
@@ -23,7 +24,7 @@ from walop_jax.diagnosis.exact import (
     with_refuted_priors_widened,
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.diagnosis.search import State
@@ -32,7 +33,7 @@ from walop_jax.fit.robust import field_cells, states
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described
+from walop_jax.model.effects import Described
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,6 @@ class Refits:
     takes).
     """
 
-    context: Context
     hypotheses: Hypotheses
     rng: np.random.Generator
     tell: Callable[[str], None]
@@ -80,10 +80,10 @@ class Refits:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
             description = self._with_best_times(evidence, shortest(item))
-            refitted = try_effect(evidence.result, description, self.context, len(evidence.sentences))
+            refitted = try_effect(evidence.result, description, len(evidence.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
-            refitted = try_shapes(evidence.result, item, self.context, shapes)
+            refitted = try_shapes(evidence.result, item, shapes)
         return dataclasses.replace(refitted, item=item, linear=trial.linear)
 
     def _with_best_times(self, evidence: Examination, description: Described) -> Described:
@@ -115,9 +115,9 @@ class Refits:
         for effect in self.hypotheses.effects if state.evidence.poor else ():
             if effect.is_structural() and effect.name not in result.model.effect_names and allowed():
                 self.tell(f"trying {effect.name}")
-                trials.append(try_effect(result, effect.neutral(self.context), self.context))
+                trials.append(try_effect(result, effect.neutral(context_of(result))))
         described, compared = other_descriptions(
-            result, self.context, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
+            result, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
         )
         return [*trials, *described], {**state.choices, **compared}
 
@@ -126,8 +126,7 @@ class Refits:
         assert trial.fit is not None
         after = Design.of(trial.fit)
         compared = before_and_after(trial.effect.name, evidence.design, after)
-        closer = compared["heldout_after"] < compared["heldout_before"]
-        against = contradicting(evidence.design, after) if closer else ""
+        against = contradicting(evidence.design, after) if compared.confirmed else ""
         if against:
             self.tell(f"{trial.name}: exposures of {against} speak against it")
         return dataclasses.replace(trial, compared=compared, against=against)
@@ -137,21 +136,23 @@ class Refits:
         assert trial.fit is not None
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
-        compared, alike = dict(trial.compared), (*trial.rivals, *trial.nameless)
+        compared, alike = trial.compared, (*trial.rivals, *trial.nameless)
         groups = {trial.name: alike} if trial.effect is Described else {}
         if result is not trial.fit:
-            compared |= before_and_after(name, evidence.design, Design.of(result))
+            compared = before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
         table = evidence.table
-        compared["score"] = item.score.statistic if item else evidence.chi2 - trial.left
-        compared["p_value"] = table.corrected(item.score) if item else table.p_global
+        score = item.score.statistic if item else evidence.chi2 - trial.left
+        p_value = table.corrected(item.score) if item else table.p_global
         steps = [step for step in state.steps if step.effect is not trial.effect]
         # A further change of the description joins those before.
         for earlier in (step for step in state.steps if step.effect is trial.effect):
             before = "chi2_before", "heldout_before", "residual_before"
-            compared |= {key: earlier.compared[key] for key in before}
+            compared = dataclasses.replace(
+                compared, **{key: getattr(earlier.compared, key) for key in before}
+            )
             groups = {**earlier.groups, **groups}
-        step = dataclasses.replace(trial, compared=compared, groups=groups)
+        step = dataclasses.replace(trial, compared=compared, score=score, p_value=p_value, groups=groups)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
 
@@ -197,41 +198,39 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
     fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
         fits.append(refit_without(fits[-1], step.effect.name))
-    compared, before = [], start
+    in_order, before = [], start
     for step, result in zip(steps, reversed(fits), strict=True):
         after = end if result is end.fit else Design.of(result)
-        changed = {**step.compared, **before_and_after(step.effect.name, before, after)}
-        compared.append(dataclasses.replace(step, compared=changed))
+        in_order.append(dataclasses.replace(step, compared=before_and_after(step.effect.name, before, after)))
         before = after
-    return compared
+    return in_order
 
 
 LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 
-def before_and_after(name: str, before: Design, after: Design) -> dict[str, Any]:
-    """The fields of a `Step` that compare the fits without and with an effect."""
+def before_and_after(name: str, before: Design, after: Design) -> FitComparison:
+    """The fits without and with an effect."""
     effect = after.fit.model.template.effect(name)
     many = any(np.size(getattr(effect, f)) > 4 for f in effect.kind.amplitudes())
     scheme = "field blocks" if many or _of_one_fold(after, name) else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
-    return {
-        "chi2_before": before.fit.chi2,
-        "chi2_after": after.fit.chi2,
-        "dof_after": after.fit.dof,
-        "heldout_scheme": scheme,
-        "heldout_before": held_out(before, scheme),
-        "heldout_after": held_out(after, scheme),
-        "change_of_qu": largest_change(old, new),
-        "residual_before": before.measured.residual,
-        "residual_after": after.measured.residual,
-    }
+    return FitComparison(
+        chi2_before=before.fit.chi2,
+        chi2_after=after.fit.chi2,
+        dof_after=after.fit.dof,
+        heldout_scheme=scheme,
+        heldout_before=held_out(before, scheme),
+        heldout_after=held_out(after, scheme),
+        change_of_qu=largest_change(old, new),
+        residual_before=before.measured.residual,
+        residual_after=after.measured.residual,
+    )
 
 
 def _of_one_fold(design: Design, name: str) -> bool:
     """True of an effect with an amplitude that only exposures of one fold show: others do not predict these."""
-    place = {int(i): k for k, i in enumerate(design.fit.model.free)}
-    at = [place[int(i)] for i in design.fit.model.positions(name) if int(i) in place]
+    at = design.columns_of(design.fit.model.positions(name))
     square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
     of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
     return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) == 1))

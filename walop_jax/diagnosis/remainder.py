@@ -1,15 +1,21 @@
-"""The end of a search: removal of unneeded additions, and the unidentified remainder."""
+"""The end of a search: removal of unneeded additions, and the unidentified remainder.
+
+Names compete with the numbers that a set states: one of these, if it is wrong, may explain the data as well.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy import special
 
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import held_out, strata
-from walop_jax.diagnosis.exact import Trial, evidence_of_presence, try_effect
+from walop_jax.diagnosis.design import Design, held_out, strata
+from walop_jax.diagnosis.exact import Trial, context_of, evidence_of_presence, log_evidence_ratio, try_effect
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Unexplained, describe
 from walop_jax.diagnosis.refits import (
@@ -20,9 +26,13 @@ from walop_jax.diagnosis.refits import (
     settled,
     without,
 )
+from walop_jax.diagnosis.score import local_p
 from walop_jax.diagnosis.search import State
-from walop_jax.fit.refit import FitResult
+from walop_jax.diagnosis.stated_conditions import ALIKE, Singles, condition_scores
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.io.text import with_error
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, OtherDescription
 
 Remainder = tuple[State, Unexplained | None]
@@ -134,7 +144,7 @@ def _parts(first: State, state: State) -> dict[str, str]:
         return {}
     partial = {}
     for step in (step for step in state.steps if step.effect is not OtherDescription):
-        before, after = (step.compared[f"chi2_{when}"] / freedom for when in ("before", "after"))
+        before, after = step.compared.chi2_before / freedom, step.compared.chi2_after / freedom
         partial[step.effect.name] = f"{step.effect.name} (χ²/dof {before:.3g} → {after:.3g})"
     return partial
 
@@ -157,7 +167,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
     if not useful:
         return _and(remainder, _LEFT_OUT), None
-    trial = try_effect(result, FreeForm.of(judge.context, blocks=useful), judge.context)
+    trial = try_effect(result, FreeForm.of(context_of(result), blocks=useful))
     if trial.fit is None or not trial.fit.converged:
         return remainder, None
     after = settled(trial.fit, [step.effect.name for step in state.steps])
@@ -201,7 +211,7 @@ def _worse(first: Examination, state: State) -> str:
     if not state.steps:  # numbers of a free-form term for single exposures predict no others
         return ""
     # A number for every exposure predicts no exposure that is left out, but places in the field.
-    schemes = [step.compared["heldout_scheme"] for step in state.steps]
+    schemes = [step.compared.heldout_scheme for step in state.steps]
     scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
     before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
     if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
@@ -211,7 +221,7 @@ def _worse(first: Examination, state: State) -> str:
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:
     """The first model again: the additions are reported as parts."""
-    changes = ((s.effect.name, s.compared["chi2_before"], s.compared["chi2_after"]) for s in state.steps)
+    changes = ((s.effect.name, s.compared.chi2_before, s.compared.chi2_after) for s in state.steps)
     partial = tuple(f"{name} (χ² {before:.4g} → {after:.4g})" for name, before, after in changes)
     added = "; ".join(partial) or "a free-form term"
     text = f"the model with all additions predicts worse {worse}, so nothing was adopted: {added}"
@@ -237,3 +247,81 @@ _LEFT_OUT = (
 
 def _and(remainder: Unexplained, text: str) -> Unexplained:
     return dataclasses.replace(remainder, description=f"{remainder.description}. {text}")
+
+
+# ------------------------------------------------------------------------------- numbers that a set states, and names
+
+_FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of each
+
+
+def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterator[str]:
+    """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
+
+    `design` is of the fit before anything was added to its model, `conditions` are its `condition_scores`.
+    """
+    scored = [item for item in conditions.testable if abs(item.score.amplitudes[0]) < item.stated.width]
+    errors = design.fit.noise_scale**2  # of the scores; those of `chi2` are as given
+    square = float(np.sum(design.projector(design.residual) ** 2))
+    least = special.chdtri(1, local_p(thresholds.ALARM, len(scored)))
+    gains = [float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) for item in scored]
+    likely = [k for k, gain in enumerate(gains) if (square - gain) * errors < chi2 + ALIKE and gain > least]
+    if likely:
+        likely.sort(key=lambda k: -gains[k])
+        shown = (scored[k] for k in likely[: thresholds.SHOWN])
+        causes = "; or ".join(item.single.worded(item.score) for item in shown)
+        yield f"what was found explains no more than one number that the set states would, if it were {causes}"
+
+
+def beside_conditions(
+    first: State, state: State, remainder: Unexplained | None, conditions: Singles
+) -> Remainder:
+    """The end of a search, or the first state where a number that the set states explains more than names do."""
+    fits = first.evidence.result, state.evidence.result
+    stated = instead_of_names(conditions, *fits) if conditions.items else ""
+    if not stated:
+        return state, remainder
+    partial = () if remainder is None else remainder.parts
+    names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
+    text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
+    return back_to(first, state), Unexplained(first.evidence.table.p_global, text, (), parts=partial)
+
+
+def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -> str:
+    """The number that the set states which, if wrong, explains the data better than names do; empty: none.
+
+    `conditions` are the `condition_scores` of `before`. Numbers that are as probable are reported together. Where
+    nothing was added (`after` is `before`) only what explains the data is reported.
+
+    Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
+    with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
+    """
+    if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
+        after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
+    added = after is not before
+    least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
+    for current in conditions.clear[:_FITTED]:
+        stated, size, result = current.stated, 0.0, before
+        for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
+            size += float(current.score.amplitudes[0])
+            if abs(size) >= stated.width:  # a latitude beyond the pole, a negative temperature
+                break
+            likelihood = Likelihood.of(stated.changed(size), before.model)
+            result = fit(likelihood, start=result.values, noise_scale=before.noise_scale)
+            rescored = condition_scores(Design.of(result), stated.what).items if result.converged else ()
+            if not rescored:
+                break
+            (current,) = rescored
+        worth = 0.5 * (before.expansion.objective - result.expansion.objective)
+        worth -= 0.5 * float(np.log1p(float(current.rest[0]) * stated.width**2))
+        explained = result.explains_data or result.nearly_explains_data
+        if result.converged and abs(size) < stated.width and worth > least and (added or explained):
+            value = size if stated.value is None else stated.value + size
+            sigma = float(np.sqrt(current.score.covariance[0, 0]))
+            by = " changed by" if stated.value is None else ""
+            text = f"{stated.what}{by} {with_error(value, sigma)} {stated.unit}".rstrip()
+            text += f" ({stated.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
+            likely.append((worth, text))
+    best = max((worth for worth, _ in likely), default=0.0)
+    return "; or ".join(
+        text for worth, text in sorted(likely, reverse=True) if worth > best - thresholds.EVEN_ODDS
+    )

@@ -117,7 +117,7 @@ def refused(evidence: Evidence, trial: Trial) -> str:
     if not suffices and not evidence.stands(trial.effect, trial.evidence, fitted):
         best = evidence.best_pattern(fitted=fitted)
         return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
-    before, after = (trial.compared.get(f"heldout_{when}", np.nan) for when in ("before", "after"))
+    before, after = trial.compared.heldout_before, trial.compared.heldout_after
     if after >= before:
         return (
             f"data that were left out agree worse with it (mean squared residual {before:.4g} → {after:.4g})"

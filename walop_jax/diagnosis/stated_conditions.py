@@ -39,7 +39,6 @@ from walop_jax.diagnosis.readings import with_places, with_values
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
-from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.specification import effect_context
 
@@ -103,6 +102,12 @@ class Scored(NamedTuple):
     rest: Float[np.ndarray, " c"]
     alive: Bool[np.ndarray, " c"]
 
+    @property
+    def stated(self) -> Stated:
+        """The number of the set that it is."""
+        assert self.single.stated is not None
+        return self.single.stated
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Singles:
@@ -123,9 +128,16 @@ class Singles:
         return dataclasses.replace(scored(design, rivals), asked=effects)
 
     @property
-    def testable(self) -> list[Score]:
-        """The scores of those of which the parameters leave something."""
-        return [item.score for item in self.items if item.score.testable]
+    def testable(self) -> list[Scored]:
+        """Those of which the parameters leave something."""
+        return [item for item in self.items if item.score.testable]
+
+    @property
+    def clear(self) -> list[Scored]:
+        """Those that the residuals ask for, after correction for all testable ones, the clearest first."""
+        tried = self.testable
+        clear = (item for item in tried if corrected_p(item.score.log_p, len(tried)) < thresholds.ALARM)
+        return sorted(clear, key=lambda item: item.score.log_p)
 
 
 def scored(design: Design, rivals: Sequence[Single]) -> Singles:
@@ -153,24 +165,23 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     Of a fit that does not explain its data only where one of them alone would.
     """
     singles = singles or Singles.of(design)
-    scores = singles.testable
-    clear = [score for score in scores if corrected_p(score.log_p, len(scores)) < thresholds.ALARM]
+    clear = singles.clear
     if not clear:
         return
-    clear.sort(key=lambda score: score.log_p)
-    best, result = clear[0], design.fit
+    best, result = clear[0].score, design.fit
     square = float(np.sum(design.projector(design.residual) ** 2))
     rest = square - best.statistic * singles.noise_scale**2
     if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    likely = [item for item in clear if item.statistic - item.rank > best.statistic - best.rank - ALIKE]
+    least = best.statistic - best.rank - ALIKE
+    likely = [item for item in clear if item.score.statistic - item.score.rank > least]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
-    likely = [item for item in likely if not any(_holds(item, rival) for rival in likely)]
-    likely.sort(key=lambda item: (item.rank, item.log_p))  # a mistake of one number before sixteen
-    wordings = {item.single.candidate.name: item.single.worded for item in singles.items}
-    causes = "; or for ".join(wordings[score.name](score) for score in likely[: thresholds.SHOWN])
+    likely = [item for item in likely if not any(_holds(item.score, rival.score) for rival in likely)]
+    # A mistake of one number comes before one of sixteen.
+    likely.sort(key=lambda item: (item.score.rank, item.score.log_p))
+    causes = "; or for ".join(item.single.worded(item.score) for item in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
-    p = corrected_p(best.log_p, len(scores))
+    p = corrected_p(best.log_p, len(singles.testable))
     yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
 
 
@@ -191,7 +202,7 @@ def _conditions(design: Design, what: str = "") -> Iterator[Single]:
         candidate = Candidate(item.what, column, np.array([item.width]))
         # What stars see as well is no mistake of the matrix alone.
         plausible = 0.0 if item.seen_by_stars else item.width
-        wording = functools.partial(condition_in_words, item)
+        wording = functools.partial(_condition_in_words, item)
         yield Single(candidate, wording, plausible, item.unit, item.shown_by, item)
 
 
@@ -231,8 +242,7 @@ def _of_cameras(design: Design) -> Iterator[Single]:
     def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
-        column = project_flux(cube * measured.weight, measured.model, measured.known, measured.shared)
-        rows = design.stacked([-column[measured.used].reshape(-1, 1)])
+        rows = design.stacked([measured.derivative(cube)[:, None]])
         name = words.format(names[k])
         wording = functools.partial(_worded, f"{name} of", unit=unit)
         return Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
@@ -290,7 +300,7 @@ def _worded(
     return f"{what} {with_error(start + float(score.amplitudes[number]) * width, sigma)} {unit}".rstrip()
 
 
-def condition_in_words(stated: Stated, score: Score) -> str:
+def _condition_in_words(stated: Stated, score: Score) -> str:
     """A number that the set states, with its score, and what to check."""
     if stated.value is None:
         return f"{_worded(f'{stated.what} changed by', score, unit=stated.unit)} ({stated.remedy})"
@@ -298,10 +308,9 @@ def condition_in_words(stated: Stated, score: Score) -> str:
     return f"{text}, not {stated.value:g} ({stated.remedy})"
 
 
-def condition_scores(design: Design, what: str = "") -> list[tuple[Stated, Scored]]:
+def condition_scores(design: Design, what: str = "") -> Singles:
     """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
-    items = scored(design, tuple(_conditions(design, what))).items
-    return [(item.single.stated, item) for item in items if item.single.stated is not None]
+    return scored(design, tuple(_conditions(design, what)))
 
 
 def _columns(design: Design, statements: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:

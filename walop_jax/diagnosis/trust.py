@@ -32,6 +32,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -214,10 +215,9 @@ def _summed_pixels(result: FitResult) -> Iterator[str]:
 
 def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
     """The structure of field points with that of the pixels that they stand for."""
-    compression = result.calset.compression
-    gain, response = (
-        (0.0, 0.0) if compression is None else (compression.gain or 0.0, compression.response or 0.0)
-    )
+    if (compression := result.calset.compression) is None:
+        return structure
+    gain, response = compression.gain or 0.0, compression.response or 0.0
     return Structure(float(np.hypot(structure.gain, gain)), float(np.hypot(structure.response, response)))
 
 
@@ -288,8 +288,7 @@ def _significant(finding: str, table: ScoreTable) -> Iterator[str]:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class _GroupScore:
+class _GroupScore(NamedTuple):
     """Squared residuals of a group of the data beside those of the rest.
 
     `ratio` is 1 where the group scatters as the rest does; `p_value` that of a ratio so far from 1, on either side.

@@ -93,12 +93,9 @@ def variance_components(design: Design, *, pixels: bool = False) -> list[Varianc
     """Every grouping that the data have, asked by itself; of single `pixels` those of field points alone."""
     residual = design.projector(design.residual)
     square = float(residual @ residual)
-    ready = (asked(design, grouping, residual[:, None]) for grouping in groupings(design, pixels=pixels))
-    return (
-        [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
-        if square > 0
-        else []
-    )
+    grouped = groupings(design, pixels=pixels) if square > 0 else ()
+    ready = (asked(design, grouping, residual[:, None]) for grouping in grouped)
+    return [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
 
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:

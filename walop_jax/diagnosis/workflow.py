@@ -23,27 +23,19 @@ import numpy as np
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import only_a_class, with_average
+from walop_jax.diagnosis.class_product import Classes, only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import (
-    Diagnosis,
-    Outcome,
-    Step,
-    Unexplained,
-    describe,
-    descriptions_of,
-)
+from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, describe, descriptions_of
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
-from walop_jax.diagnosis.remainder import back_to, concluded
-from walop_jax.diagnosis.rival_conditions import instead_of_names, rival_conditions
+from walop_jax.diagnosis.remainder import beside_conditions, concluded, rival_conditions
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
-from walop_jax.diagnosis.stated_conditions import condition_scores
+from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
@@ -52,9 +44,9 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Context, Described, EffectKind
+from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.parameters import values_of
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import Model
 
 
 def diagnose(
@@ -82,7 +74,6 @@ def diagnose(
     model = model or base_model(calset)
     catalogue = model.catalogue if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
-    context = effect_context(model.template, calset.exposures)
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
     sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)
     if len(sample.points) < len(calset.points):
@@ -93,7 +84,6 @@ def diagnose(
     if readings and readings[0].explained < thresholds.READING_SURE:
         raise refusal(before, readings)
     judge = Refits(
-        context=context,
         hypotheses=candidates,
         rng=np.random.default_rng(seed),
         tell=tell,
@@ -104,30 +94,16 @@ def diagnose(
     tell(Stage("scoring every effect and pattern", "scoring"))
     first = State(judge.examined(before))
     state, remainder = concluded(first, search(first, judge), judge)
-    after = state.evidence.result
+    explained = state.evidence.result
     # Another reading that comes near competes with names and with other descriptions of the instrument.
-    if remainder and readings and readings[0].explained * after.dof < after.chi2:
+    if remainder and readings and readings[0].explained * explained.dof < explained.chi2:
         raise refusal(before, readings)
-    conditions = condition_scores(first.evidence.design) if state.steps or remainder else []
-    if stated := instead_of_names(conditions, before, after) if conditions else "":
-        partial = () if remainder is None else remainder.parts
-        names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
-        text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
-        remainder = Unexplained(first.evidence.table.p_global, text, (), parts=partial)
-        state = back_to(first, state)
-        after = before
-    evidence, added = state.evidence, [step.effect.name for step in state.steps]
-    steps = tuple(_finished(step, evidence, context, added) for step in state.steps)
+    conditions = condition_scores(first.evidence.design) if state.steps or remainder else Singles()
+    state, remainder = beside_conditions(first, state, remainder, conditions)
+    after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
+    steps = tuple(_finished(step, evidence, added) for step in state.steps)
     verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
     tell("examining the residuals")
-    alike = dict[str, Collection[str]]()
-    # Of a single group also what the final model cannot separate from it; of several that is of all together.
-    for trial, step in zip(state.steps, steps, strict=True):
-        names = tuple(trial.groups) or (step.effect,)
-        alone = {*step.equivalent, *step.nameless} - {Described.name}
-        alike |= {names[0]: alone} if len(names) == 1 else trial.groups
-    first_effects = before.model.template.effects
-    given = [text for e in first_effects if isinstance(e, Described) for text in e.sentences]
     diagnosis = Diagnosis(
         verdict=verdict,
         steps=steps,
@@ -149,7 +125,7 @@ def diagnose(
         ),
         classes=tuple(first.evidence.classes()),
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
-        members=ambiguities(evidence, alike, given),
+        members=_members(first, state, steps),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates),
         descriptions=len(candidates.sentences) + len(candidates.parts),
@@ -158,6 +134,19 @@ def diagnose(
     rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
     return _examined(diagnosis, tables, rivals, seed)
+
+
+def _members(first: State, state: State, steps: Sequence[Step]) -> Classes:
+    """Candidates that the data cannot distinguish from the additions, and their effect on stars."""
+    alike = dict[str, Collection[str]]()
+    # Of a single group also what the final model cannot separate from it; of several that is of all together.
+    for trial, step in zip(state.steps, steps, strict=True):
+        names = tuple(trial.groups) or (step.effect,)
+        alone = {*step.equivalent, *step.nameless} - {Described.name}
+        alike |= {names[0]: alone} if len(names) == 1 else trial.groups
+    effects = first.evidence.result.model.template.effects
+    given = [text for e in effects if isinstance(e, Described) for text in e.sentences]
+    return ambiguities(state.evidence, alike, given)
 
 
 def _examined(
@@ -175,9 +164,9 @@ def _examined(
         return dataclasses.replace(diagnosis, before=after, after=after)
     for sentence in rivals:
         after = after.remarked(sentence)
-    # Where χ² contradicts the model given, the steps name the missing effects.
-    explained = diagnosis.before.explains_data or diagnosis.before.nearly_explains_data
     before = diagnosis.before
+    # Where χ² contradicts the model given, the steps name the missing effects.
+    explained = before.explains_data or before.nearly_explains_data
     before = examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.judged()
     return dataclasses.replace(diagnosis, before=before, after=after)
 
@@ -200,10 +189,10 @@ def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict
     return reasons | {probe.name: name for probe in candidates.every if probe.name not in scored}
 
 
-def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequence[str]) -> Step:
+def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step:
     """An addition with its final parameters, what cannot be separated from it, and where it sits."""
     result, name = evidence.result, trial.effect.name
-    change = signature(result, name, context)
+    change = signature(result, name)
     separation = evidence.separation(name, change)
     close = {rival for rival, s in separation.items() if s < thresholds.SEPARATION} | set(trial.rivals)
     close -= set(added)
@@ -219,7 +208,9 @@ def _finished(trial: Trial, evidence: Examination, context: Context, added: Sequ
         log_bayes=trial.evidence,
         nameless=trial.nameless,
         alternatives=trial.alternatives,
-        **trial.compared,
+        score=trial.score,
+        p_value=trial.p_value,
+        **vars(trial.compared),
         descriptions=descriptions_of(result) if name == Described.name else (),
         far=beyond_prior(result, name),
         choices=spoken_choices(effect),

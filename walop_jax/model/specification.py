@@ -308,14 +308,14 @@ def with_effects(
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
 
 
-def with_sentences(model: Model, description: Described, context: Context) -> Model:
+def with_sentences(model: Model, description: Described, data: Context | CalibrationSet) -> Model:
     """The model with further sentences; those that it has keep their parameters."""
     if Described.name not in model.effect_names:
-        return with_effects(model, [description], context)
+        return with_effects(model, [description], data)
     earlier = model.template.effect(Described.name)
     assert isinstance(earlier, Described)
     parameters = {p.name: p for p in model.parameters}
-    wider = with_effects(model_without(model, Described.name), [earlier.joined(description)], context)
+    wider = with_effects(model_without(model, Described.name), [earlier.joined(description)], data)
     return dataclasses.replace(wider, parameters=tuple(parameters.get(p.name, p) for p in wider.parameters))
 
 
