@@ -1,6 +1,6 @@
 """Whether the limits of `walop-jax limits` hold: the amplitudes that are found and named, and the protection level.
 
-    python tests/studies/limits_hold.py [--draws 2000] [--named 300] [--instruments 8] [OUT.json]     (20 minutes)
+    python tests/studies/limits_hold.py [--draws 2000] [--named 300] [--instruments 8] [--first 0] [OUT.json]     (20 minutes)
 
 found    Scores are drawn with each effect at 0.9, 1 and 1.1 times the amplitude that the limits say is found with
          99 %, all sentences competing: the amplitude at which 99 % of the draws raise the alarm, over the predicted.
@@ -38,7 +38,7 @@ from walop_jax.diagnosis.detection_limits import (  # noqa: E402
 )
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes  # noqa: E402
-from walop_jax.diagnosis.score import separations  # noqa: E402
+from walop_jax.diagnosis.score import local_p, separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
@@ -78,9 +78,9 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     said = grammar.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, Hypotheses(every), np.random.default_rng(0))
     whole = examine(result, Hypotheses(every, said), np.random.default_rng(0))
-    p = names.table.local(thresholds.ALARM)
+    p = local_p(thresholds.ALARM, names.table.trials)
     space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
-    noise, threshold = noise_scores(space, rng, draws), np.log(whole.table.local(thresholds.ALARM))
+    noise, threshold = noise_scores(space, rng, draws), np.log(local_p(thresholds.ALARM, whole.table.trials))
     noise_in_full = noise_scores(full, rng, named)
     places = full.places()
     found: dict[str, dict[str, float]] = {}
@@ -122,7 +122,7 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     calset = reference.calset
     every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
     names = examine(reference, Hypotheses(every), np.random.default_rng(0))
-    p = names.table.local(thresholds.ALARM)
+    p = local_p(thresholds.ALARM, names.table.trials)
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)
     bare = matrices_of(truth, calset)
@@ -141,7 +141,7 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
 
 def main() -> None:
     """Print the numbers of the study, and write them where a file is named."""
-    parser = options_of(__doc__, draws=2000, named=300, instruments=8, effects=99)
+    parser = options_of(__doc__, draws=2000, named=300, instruments=8, first=0, effects=99)
     parser.add_argument("output", nargs="?", type=Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -149,7 +149,7 @@ def main() -> None:
     if options.draws:
         found["scores"] = scores(refit(simulate(PLAN, seed=11).calset), options.draws, options.named)
     shares = []
-    for seed in range(options.instruments):
+    for seed in range(options.first, options.first + options.instruments):
         for name, share in sets(seed, options.effects):
             shares.append((seed, name, share))
             print(seed, name, f"{share:.3f}", flush=True)
