@@ -208,7 +208,7 @@ MOST_LINES = {
     "sky": 443,
     "model": 9663,
     "likelihood": 3406,
-    "simulation": 1126,
+    "simulation": 1127,
     "fit": 2126,
     "calibration": 2647,
     "posterior": 2174,

@@ -24,7 +24,7 @@ from walop_jax.fit.refit import refit
 from walop_jax.instruments.description import shipped
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import make_model, with_effects
@@ -427,3 +427,21 @@ def test_wavelengths_of_largest_polarisation_are_those_of_polarised_standards(un
     plan = ObservingPlan(grid=2, standards=3, unpolarised=unpolarised, star_lmax=(0.45, 0.65))
     _, truth = true_instrument(plan)
     np.testing.assert_array_equal(truth.standard.lmax, lmax)
+
+
+@pytest.mark.parametrize("sentence", ["gain of E1 * counts * y", "gain of E1 * hours"])
+def test_detectors_answer_at_the_place_of_the_light(sentence):
+    """A gain 1 + a N y or 1 + a t: what it adds, over N² y or N, is one number in all points of an exposure."""
+    sets = [
+        simulate(SMALL, 10, effects=effects, noiseless=True)
+        for effects in ([], [Described.saying([sentence], [1e-3])])
+    ]
+    plain, changed = map(block_of, sets)
+    camera = nominal_instrument().cameras.names.index("E1")
+    counts, used = plain.counts[..., camera], plain.used
+    share = changed.counts[..., camera] / np.where(used, counts, 1.0) - 1.0
+    by = counts * sets[0].calset.points.y[:, None] if "counts" in sentence else np.ones_like(counts)
+    slopes = np.where(used & (by != 0.0), share / np.where(by == 0.0, 1.0, by), np.nan)
+    typical = np.nanmedian(slopes, axis=0)
+    assert np.abs(typical).max() > 0.0
+    assert np.nanmax(np.abs(slopes - typical)) < 1e-9 * np.abs(typical).max()

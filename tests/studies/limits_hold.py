@@ -1,6 +1,8 @@
 """Whether the limits of `walop-jax limits` hold: the amplitudes that are found and named, and the protection level.
 
-    python tests/studies/limits_hold.py [--draws 2000] [--named 300] [--instruments 8] [--first 0] [OUT.json]     (20 minutes)
+    python tests/studies/limits_hold.py [--draws 2000] [--named 300] [--instruments 8] [--first 0] [OUT.json]
+
+Twenty minutes.
 
 found    Scores are drawn with each effect at 0.9, 1 and 1.1 times the amplitude that the limits say is found with
          99 %, all sentences competing: the amplitude at which 99 % of the draws raise the alarm, over the predicted.
@@ -38,7 +40,7 @@ from walop_jax.diagnosis.detection_limits import (  # noqa: E402
 )
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes  # noqa: E402
-from walop_jax.diagnosis.score import local_p, separations  # noqa: E402
+from walop_jax.diagnosis.score import ScoreSpace, local_p, separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
@@ -62,6 +64,11 @@ def one_shape_each(examination: Examination) -> Iterator[Probe]:
             yield probe
 
 
+def rivals_of(names: Examination) -> ScoreSpace:
+    """The space of all effects, without the nuisance of single exposures."""
+    return names.bare.subset([probe.name for probe in names.probes])
+
+
 def amplitude_at(rate: Callable[[float], float], predicted: float) -> float:
     """The amplitude with a rate of `thresholds.PROBABILITY`, over the predicted one: interpolated probits."""
     rates = np.clip([rate(share * predicted) for share in TRIED], 1e-4, 1 - 1e-4)
@@ -78,14 +85,14 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     said = grammar.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, Hypotheses(every), np.random.default_rng(0))
     whole = examine(result, Hypotheses(every, said), np.random.default_rng(0))
-    p = local_p(thresholds.ALARM, names.table.trials)
+    p = local_p(thresholds.ALARM, whole.table.trials)
     space, full, rng = whole.space, whole.bare, np.random.default_rng(1)
-    noise, threshold = noise_scores(space, rng, draws), np.log(local_p(thresholds.ALARM, whole.table.trials))
+    noise, threshold = noise_scores(space, rng, draws), np.log(p)
     noise_in_full = noise_scores(full, rng, named)
     places = full.places()
     found: dict[str, dict[str, float]] = {}
     for probe in one_shape_each(names):
-        limit, at = _columns(names, probe, p)[0], places[probe.name]
+        limit, at = _columns(names, rivals_of(names), probe, p)[0], places[probe.name]
         place = at.start + limit.number
 
         def detected(amplitude: float, place: int = place) -> float:
@@ -120,14 +127,14 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     truth = reference.model.instrument(reference.values)
     limits = detection_limits(reference)
     calset = reference.calset
-    every = list(probes(EFFECTS, effect_context(reference.model.template, calset.exposures)))
-    names = examine(reference, Hypotheses(every), np.random.default_rng(0))
-    p = local_p(thresholds.ALARM, names.table.trials)
+    listed = grammar.hypotheses(EFFECTS, reference.model.template, calset.exposures, len(calset.points))
+    names = examine(reference, listed, np.random.default_rng(0))
+    rivals, p = rivals_of(names), local_p(thresholds.ALARM, names.table.trials)
     without = refit(simulate(PLAN, seed=seed, instrument=truth).calset)
     start = matrices_of(without.model.instrument(without.values), calset)
     bare = matrices_of(truth, calset)
     for probe in list(one_shape_each(names))[:most]:
-        limit = _columns(names, probe, p)[0]
+        limit = _columns(names, rivals, probe, p)[0]
         step = np.zeros(len(probe.widths))
         step[limit.number] = BELOW * limit.detected
         effect = probe.effect.combine(probe.group, step)

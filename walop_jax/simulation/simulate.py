@@ -338,7 +338,8 @@ def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, 
     for _ in range(_MEDIAN_ROUNDS if needs(truth).median else 1):
         used_counts = np.where(likelihood.used[:, :, None], counts, np.nan)
         plan = with_median(likelihood.plan, np.nanmedian(used_counts, axis=0))
-        counts = np.asarray(engine.detected(truth, plan.exposures, array(light_counts)))
+        at = array(light_counts), array(blank.points.x), array(blank.points.y)
+        counts = np.asarray(engine.detected(truth, plan.exposures, *at))
     return counts
 
 
