@@ -17,7 +17,7 @@ from walop_jax.calibration.calibration import UNCHECKED
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.product import content_of, read_product, write_calibration
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.fit.verdict import Hidden, Structure
+from walop_jax.fit.verdict import Hidden, Mistake, Structure
 from walop_jax.io.errors import DataError
 
 OF_FITS = re.compile(
@@ -34,9 +34,8 @@ EARLIER = Path(__file__).with_name("product_of_an_earlier_rule.fits.gz")
 def path(two_cameras, tmp_path):
     """A product with everything that a product may hold."""
     product = product_of(read_calibration_set(two_cameras.write()), 2, {"HWP": 22.5})
-    hidden = Hidden(
-        ("scale of X and Y", "pedestal"), (0.02, 1.5), ("", "electron"), np.arange(4.0).reshape(2, 2)
-    )
+    mistakes = Mistake("scale of X and Y", 0.02, ""), Mistake("pedestal", 1.5, "electron")
+    hidden = Hidden(mistakes, np.arange(4.0).reshape(2, 2))
     verdict = dataclasses.replace(product.verdict, structure=Structure(1e-4, 2e-5))
     full = dataclasses.replace(product, hidden=hidden, verdict=verdict)
     write_calibration(tmp_path / "whole.fits", full)
