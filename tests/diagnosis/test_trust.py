@@ -237,6 +237,13 @@ def test_squares_of_groups_follow_their_distribution(south_set, south_fit):
         p += [(s.name, s.p_value) for s in group_scores(dataclasses.replace(design, residual=rows))]
     for kind in ("camera", "exposure"):
         assert stats.kstest([v for name, v in p if name.startswith(kind)], "uniform").pvalue > 1e-3
+    # One that scatters less than the rest is as improbable as one that scatters more.
+    for factor in (0.5, 2.0):
+        rows[: design.rows] = (noise * np.where(np.arange(noise.shape[1]) == 0, factor, 1.0)).reshape(-1)
+        first = group_scores(dataclasses.replace(design, residual=rows))[0]
+        assert first.name.startswith("camera")
+        assert first.p_value < 1e-9
+        assert (first.ratio < 1.0) is (factor < 1.0)
 
 
 def test_an_examination_changes_no_value(plain, clean):
