@@ -196,8 +196,8 @@ def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | Non
     return factor, True
 
 
-def cholesky_solve(factor: tuple[Matrix, bool], right: Any) -> Any:
-    """The inverse of a factored matrix times right sides, of which there may be none."""
+def cholesky_solve(factor: tuple[Matrix, Any], right: Any) -> Any:
+    """The inverse of a factored matrix (`scipy.linalg.cho_factor`) times right sides, of which there may be none."""
     return linalg.cho_solve(factor, right, check_finite=False) if right.size else right
 
 
