@@ -136,7 +136,8 @@ def sets(seed: int, most: int) -> Iterator[tuple[str, float]]:
     for probe in list(one_shape_each(names))[:most]:
         limit = _columns(names, rivals, probe, p)[0]
         step = np.zeros(len(probe.widths))
-        step[limit.number] = BELOW * limit.detected
+        # Beyond the width of its prior an effect is not plausible: the protection level ends there.
+        step[limit.number] = BELOW * min(limit.detected, float(probe.widths[limit.number]))
         effect = probe.effect.combine(probe.group, step)
         result = refit(simulate(PLAN, seed=seed, instrument=truth, effects=(effect,)).calset)
         assumed = matrices_of(result.model.instrument(result.values), calset) - start
