@@ -302,9 +302,8 @@ class LinearStep:
             return None
         column = design.stacked([self.laid.columns.of(sums)])
         if widths is None:
-            widths = np.array(
-                [amplitude[0][1].width(context_of(self.laid.fit).largest) for amplitude in sums]
-            )
+            largest = context_of(self.laid.fit).largest
+            widths = np.array([amplitude[0][1].width(largest) for amplitude in sums])
         name = "; ".join(sentence.text for sentence in sentences_in(sums))
         twin = self.member(name, sums, column, widths)
         # The same difference, seen from the other side: as probable, however its throughputs are known.

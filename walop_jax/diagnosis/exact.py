@@ -48,13 +48,12 @@ class Trial:
     """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none), `score` and `p_value` are those
-    of the linear test when it was added. `fit` is None until it has been
-    fitted. `alternatives` are other shapes of the effect that do as well, in words. `rivals` are effects of nearly its
-    evidence, or of which a part would do, `nameless` sentences that are not improbable beside it. `predicts` is False
-    where its linear step does not predict held-out data, `compared` are the fits without and with it
-    (`refits.before_and_after`), `against` the KINDs of exposures that contradict it, `refused` the reason for
-    which it was not added, `groups` the groups of sentences that were added one after the other, each with the
-    candidates that were as good then.
+    of the linear test when it was added. `fit` is None until it has been fitted. `alternatives` are other shapes of the
+    effect that do as well, in words. `rivals` are effects of nearly its evidence, or of which a part would do,
+    `nameless` sentences that are not improbable beside it. `predicts` is False where its linear step does not predict
+    held-out data, `compared` are the fits without and with it (`refits.before_and_after`), `against` the KINDs of
+    exposures that contradict it, `refused` the reason for which it was not added, `groups` the groups of sentences that
+    were added one after the other, each with the candidates that were as good then.
     """
 
     effect: EffectKind

@@ -120,7 +120,7 @@ class Mistake(NamedTuple):
     measured: bool = True
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Hidden:
     """Single mistakes that the data would not show.
 

@@ -59,7 +59,7 @@ def executor_of(
 ) -> Generator[Executor | None, None, None]:
     """Executor of the workers of a Dask scheduler (or as given), or of new processes of this machine; None without.
 
-    A worker makes one night at a time. Tasks of a worker that is lost go to another one. Raises `DataError` where
+    A worker has one task at a time. Tasks of a worker that is lost go to another one. Raises `DataError` where
     `distributed` is not installed, and where no scheduler answers.
     """
     if workers is None and (scheduler is None or isinstance(scheduler, Executor)):
@@ -69,8 +69,8 @@ def executor_of(
         raise fail("Dask is not installed", advice="pip install 'walop-jax[cluster]'")
     dask, config = map(importlib.import_module, ("distributed", "dask.config"))
     with contextlib.ExitStack() as hold:
-        # Every night travels with the model, some hundred kilobytes, of which Dask would warn. And Dask makes workers
-        # return memory at once, to ask for it again: these thresholds malloc(3) reaches by itself.
+        # Every task travels with its function, some hundred kilobytes with a model in it, of which Dask would warn. And
+        # Dask makes workers return memory at once, to ask for it again: these thresholds malloc(3) reaches by itself.
         of_worker = "distributed.nanny.pre-spawn-environ.MALLOC_{}_THRESHOLD_"
         settings = {of_worker.format("TRIM"): 1 << 26, of_worker.format("MMAP"): 1 << 25}
         hold.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"} | settings))

@@ -73,7 +73,7 @@ class Chain:
                 steps, walkers, dimension = stretch.positions.shape
                 group = file.create_group(f"ensemble{number}")
                 size = {"nwalkers": walkers, "ndim": dimension, "iteration": steps}
-                random = {f"random_state_{k}": number for k, number in enumerate(state["random"])}
+                random = {f"random_state_{k}": part for k, part in enumerate(state["random"])}
                 group.attrs.update({"version": "3", "has_blobs": False, **size, **random})
                 group["chain"], group["log_prob"] = stretch.positions, stretch.log_density
                 group["accepted"] = stretch.acceptance.sum(axis=0)
