@@ -202,9 +202,9 @@ def test_the_core_is_reached_without_the_rest(entry):
 
 
 MOST_LINES = {
-    "io": 1586,
+    "io": 1587,
     "instruments": 220,
-    "data": 5716,
+    "data": 5717,
     "sky": 443,
     "model": 9663,
     "likelihood": 3406,
@@ -213,7 +213,7 @@ MOST_LINES = {
     "calibration": 2647,
     "posterior": 2174,
     "science": 5934,
-    "diagnosis": 7876,
+    "diagnosis": 7875,
     "nights": 2584,
     "plans": 2347,
     "paper": 776,

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, after_fit, command
-from walop_jax.commands.products import IN_MEMORY, Effects, Product, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
-from walop_jax.io.names import COMMISSIONING, PRODUCT
+from walop_jax.io.names import COMMISSIONING, IN_MEMORY, PRODUCT
 
 if TYPE_CHECKING:
     from walop_jax.science.commissioning import Certificate

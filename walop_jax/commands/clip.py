@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed
 from walop_jax.commands.inputs import ModelLike, Sets, set_and_model
-from walop_jax.commands.products import IN_MEMORY, Effects, InstrumentLike
+from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.errors import fail
+from walop_jax.io.names import IN_MEMORY
 from walop_jax.io.progress import Stage, repeated
 
 if TYPE_CHECKING:

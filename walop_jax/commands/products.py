@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from walop_jax.commands.command import PathLike, UsageError
 from walop_jax.fit.parameter_table import Fitted
+from walop_jax.io.names import IN_MEMORY
 from walop_jax.io.text import in_ascii
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from walop_jax.model.effects import EffectKind
     from walop_jax.posterior.result import PosteriorSample
 
-
-IN_MEMORY = "in memory"  # in place of the path of a file
 
 NOT_CARRIED_OVER = "not_carried_over"
 """Key under which results in JSON list the effects of a model that had to be left out."""

@@ -18,6 +18,7 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import shipped
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, PathLike
+from walop_jax.io.names import IN_MEMORY
 from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
@@ -131,7 +132,7 @@ class Inspection(Displayed):
         }
         rows = ((*dataclasses.astuple(g)[:5], g.angles or "", f"{100 * g.used:.0f} %") for g in self.groups)
         return Display(
-            title=", ".join(self.files) or "in memory",
+            title=", ".join(self.files) or IN_MEMORY,
             facts=tuple(facts.items()),
             head=("kind", "filter", "calibration plate", "source", ">exposures", ">angles", ">used"),
             rows=tuple(tuple(map(str, row)) for row in rows),
@@ -152,7 +153,7 @@ class InspectedSets(Displayed):
     def of(cls, calset: CalibrationSet) -> InspectedSets:
         """The inspection of a set in memory."""
         inspection = inspect(calset)
-        return cls(((", ".join(inspection.files) or "in memory", inspection),), None, inspection.faults)
+        return cls(((", ".join(inspection.files) or IN_MEMORY, inspection),), None, inspection.faults)
 
     @property
     def inspections(self) -> tuple[Inspection, ...]:

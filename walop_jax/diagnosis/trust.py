@@ -60,6 +60,7 @@ from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_structure, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.errors import fail
+from walop_jax.io.names import IN_MEMORY
 from walop_jax.io.text import some
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelExpansion
@@ -229,7 +230,7 @@ def pixel_structure(result: FitResult) -> Structure:
 def stand_in(result: FitResult) -> CalibrationSet:
     """The set of some hundred field points that stands for whole frames. Raises `DataError` for other data."""
     if not isinstance(result.expansion, PixelExpansion):
-        where = result.calset.inputs[0].path if result.calset.inputs else "in memory"
+        where = result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY
         advice = (
             "only whole frames of many pixels can, under a model that is smooth over the field, with detectors that "
             "report counts as they are; tables and small frames are small enough as they are"

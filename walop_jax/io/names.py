@@ -1,7 +1,8 @@
-"""Names of the files that a folder of results may hold."""
+"""Names of the files that a folder of results may hold, and of what is in no file."""
 
 from __future__ import annotations
 
+IN_MEMORY = "in memory"  # in place of the path of a file
 PRODUCT, MODEL = "calibration.fits", "model.toml"
 SUMMARY, FAILED = "summary.json", "summary.failed.json"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"

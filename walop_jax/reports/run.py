@@ -98,7 +98,7 @@ class FigureSource:
     @property
     def folder(self) -> Path:
         """The folder of the run, for messages."""
-        return Path("in memory") if self.run is None else self.run.folder
+        return Path(names.IN_MEMORY) if self.run is None else self.run.folder
 
     def _wanted(self, name: str, read: Callable[[Run], T | None], advice: str = OF_A_FIT) -> T:
         """Contents under the name of a file: those in memory, or `read` from the run, which must have it."""
