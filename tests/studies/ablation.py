@@ -40,7 +40,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis",
 from blind import Scene  # noqa: E402
 from generate import STEP, Layout  # noqa: E402
 from judge import opened  # noqa: E402
-from studies.sealed import WORSE, Sealed, sealed  # noqa: E402
+from studies.sealed import WORSE, Sealed, is_trusted, refusal_of, sealed, verdict_of  # noqa: E402
 from studies.sealed_judging import judged, right_of  # noqa: E402
 from study_options import options_of  # noqa: E402
 
@@ -377,14 +377,10 @@ def fitted(one: Sealed, before: list[Any]) -> Fitted:
         return before[1]
     except (DataError, ValueError) as error:
         before += [] if before else [None]
-        return Fitted(f"refused: {str(error)[:80]}", "", np.nan, False)
-    trusted = diagnosis.after.trusted and diagnosis.verdict != "unexplained"
+        return Fitted(refusal_of(error), "", np.nan, False)
+    trusted = is_trusted(diagnosis)
     product = judged(diagnosis.calibration(), trusted, one)
-    names = (
-        "; ".join(c.text for c, *_ in step.descriptions) if step.descriptions else step.effect
-        for step in diagnosis.steps
-    )
-    verdict = f"{diagnosis.verdict} {', '.join(names)}{'' if trusted else ', not trusted'}"
+    verdict = f"{verdict_of(diagnosis)}{'' if trusted else ', not trusted'}"
     return Fitted(verdict, right_of(one, diagnosis), product.error, trusted and product.wrong)
 
 

@@ -65,6 +65,7 @@ from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.diagnosis.class_product import with_average  # noqa: E402
 from walop_jax.diagnosis.discrepancy import ambiguities  # noqa: E402
 from walop_jax.diagnosis.examination import examine  # noqa: E402
+from walop_jax.diagnosis.findings import Diagnosis  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Hypotheses  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
@@ -413,7 +414,7 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
     try:
         fitted = examined(refit(one.calset))
     except (DataError, ValueError) as error:
-        return became(verdict=f"refused: {str(error)[:80]}")
+        return became(verdict=refusal_of(error))
     held = 0.0 if one.clean is one.calset else fitted.expansion.data - refit(one.clean).expansion.data
     before = judged(Calibration.from_fit(fitted), bool(fitted.trusted), one) if fitted.converged else None
     of_fit = {"held": held, "before": before}
@@ -423,20 +424,34 @@ def outcome(number: int, options: argparse.Namespace) -> Outcome:
     try:
         found = diagnose(one.calset, minutes=options.minutes)
     except (DataError, ValueError) as error:
-        return became(**of_fit, verdict=f"refused: {str(error)[:80]}")
-    trusted = found.after.trusted and found.verdict != "unexplained"
-    names = ", ".join(
-        step.effect if not step.descriptions else "; ".join(c.text for c, *_ in step.descriptions)
-        for step in found.steps
-    )
+        return became(**of_fit, verdict=refusal_of(error))
     return became(
         **of_fit,
-        after=judged(found.calibration(), trusted, one),
-        verdict=f"{found.verdict} {names}".strip(),
+        after=judged(found.calibration(), is_trusted(found), one),
+        verdict=verdict_of(found),
         p=found.p_value,
         has_class=found.members.several,
         right=right_of(one, found),
     )
+
+
+def is_trusted(diagnosis: Diagnosis) -> bool:
+    """True if the product of a diagnosis may be used."""
+    return diagnosis.after.trusted and diagnosis.verdict != "unexplained"
+
+
+def verdict_of(diagnosis: Diagnosis) -> str:
+    """The verdict, with the names and descriptions that were added."""
+    names = (
+        "; ".join(c.text for c, *_ in step.descriptions) if step.descriptions else step.effect
+        for step in diagnosis.steps
+    )
+    return f"{diagnosis.verdict} {', '.join(names)}".strip()
+
+
+def refusal_of(error: Exception) -> str:
+    """The verdict on a set that is refused."""
+    return f"refused: {str(error)[:80]}"
 
 
 def _with_undetected(fitted: FitResult) -> Calibration:
