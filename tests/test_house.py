@@ -54,7 +54,6 @@ OWNERS = {
 # Imported by nobody: tools of the tests, and what there is no need of.
 STRANGERS = {"pandas", "elli", "beartype", "hypothesis", "pytest", "oracle", "tests"}
 LONGEST = 600  # a question, not a goal: split by idea, never by length
-QUESTION = re.compile(r"(what|whether|where|how|who|which)\b", re.IGNORECASE)  # no opening of a docstring
 MACHINE = re.compile(r"""/(?:home|root|work|tmp|Users|opt|mnt|data)/|[A-Z]:\\\\|\.\./shared|file://""")
 
 
@@ -78,16 +77,6 @@ def room_of(module: str) -> str | None:
     """The room of a dotted module name; None for the package's door itself, and for `python -m`."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 and parts[1] != "__main__" else None
-
-
-def at_run_time(tree: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those for type checkers alone."""
-    waiting = [tree]
-    while waiting:
-        node = waiting.pop()
-        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)):
-            yield node
-            waiting += ast.iter_child_nodes(node)
 
 
 def imports(nodes: Iterable[ast.AST], module: str, is_package: bool) -> Iterator[tuple[int, str]]:
@@ -156,95 +145,6 @@ def test_no_room_calls_upward_through_a_string():
                 if target in ROOMS and ROOMS.index(target) > ROOMS.index(room):
                     calls.add((module.split(".", 1)[1], str(node.value).split(".", 1)[1]))
     assert calls == set()
-
-
-MOST_REACHED = {
-    "model.light": 3950,
-    "likelihood.flux": 100,
-    "diagnosis.score": 780,
-    "commands.matrix": 16481,
-    "commands.refit": 26436,
-    "commands.diagnose": 30285,
-    "commands.apply": 23471,
-}
-"""Lines that one must be able to follow from a module, all its imports followed: these may only become fewer."""
-
-
-@functools.cache
-def followed() -> dict[str, set[str]]:
-    """Modules that each module of the package imports, inside functions too; public names count as their homes."""
-    stub = ast.parse((PACKAGE / "__init__.pyi").read_text())
-    public = {a.asname: n.module for n in stub.body if isinstance(n, ast.ImportFrom) for a in n.names}
-    modules, edges = {module_name(path): path for path in files()}, {}
-    for module, path in modules.items():
-        nodes = at_run_time(tree_of(path))
-        names = [name for _, name in imports(nodes, module, path.name == "__init__.py")]
-        names = [str(public.get(name.removeprefix("walop_jax."), name)) for name in names if "." in name]
-        homes = (name if name in modules else name.rpartition(".")[0] for name in names)
-        edges[module] = {home for home in homes if home in modules and home != PACKAGE.name}
-    return edges
-
-
-def reached(entry: str) -> int:
-    """Lines of a module and of all that it imports, and these import."""
-    seen, waiting = set[str](), [f"walop_jax.{entry}"]
-    while waiting:
-        module = waiting.pop()
-        if module not in seen:
-            seen.add(module)
-            waiting += followed()[module]
-    return sum(len(path.read_text().splitlines()) for path in files() if module_name(path) in seen)
-
-
-@pytest.mark.parametrize("entry", MOST_REACHED)
-def test_the_core_is_reached_without_the_rest(entry):
-    assert reached(entry) <= MOST_REACHED[entry]
-
-
-MOST_LINES = {
-    "io": 1587,
-    "instruments": 220,
-    "data": 5717,
-    "sky": 443,
-    "model": 9663,
-    "likelihood": 3406,
-    "simulation": 1127,
-    "fit": 2126,
-    "calibration": 2647,
-    "posterior": 2174,
-    "science": 5934,
-    "diagnosis": 7875,
-    "nights": 2584,
-    "plans": 2347,
-    "paper": 776,
-    "reports": 2690,
-    "commands": 3757,
-}
-"""Lines of each room: raising one is a decision of its own."""
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_rooms_keep_to_their_size(room):
-    lines = sum(len(path.read_text().splitlines()) for path in files() if room_of(module_name(path)) == room)
-    assert lines <= MOST_LINES[room]
-
-
-def questions(tree: ast.AST) -> list[str]:
-    """Docstrings, those of constants included, that open like a question where a noun phrase or a verb would say it."""
-    texts = (
-        node.value.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    )
-    return [text for text in texts if isinstance(text, str) and QUESTION.match(text.lstrip())]
-
-
-def test_docstrings_open_with_what_comes_back():
-    assert {str(path): found for path in files() if (found := questions(tree_of(path)))} == {}
-    assert (
-        len(questions(ast.parse('"""What it is."""\nN = 1\n"""How many."""\ndef f():\n    "True if so."')))
-        == 2
-    )
 
 
 def test_every_library_is_declared():

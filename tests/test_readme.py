@@ -20,10 +20,6 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert (tmp_path / "calibration.png").stat().st_size > 50_000
 
 
-def test_it_is_short():
-    assert len(TEXT.split()) <= 900
-
-
 def test_links_and_files_exist():
     for path in (
         *re.findall(r"\]\(([^)]+)\)", TEXT),

@@ -31,24 +31,6 @@ SMALL = ObservingPlan(
 )
 
 
-LENGTHS = {
-    "lossy_wedge.py": 15,
-    "blue_depolariser.py": 15,
-    "twilight.py": 18,
-    "two_cameras.toml": 45,
-    "other_arms.toml": 28,
-}
-
-
-@pytest.mark.parametrize(("name", "most"), LENGTHS.items())
-def test_it_takes_few_lines(name, most):
-    lines = [
-        line for line in (HERE / name).read_text().splitlines() if line.strip() and not line.startswith("#")
-    ]
-    print(f"{name}: {len(lines)} lines")
-    assert len(lines) <= most
-
-
 def matrix(instrument: Instrument, wavelength: float, x: float, y: float) -> np.ndarray:
     """Rows (m_1, m_q, m_u) of the instrument matrix in a monochromatic band."""
     curves = {"band": builders.monochromatic(wavelength)}

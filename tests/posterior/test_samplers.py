@@ -84,12 +84,6 @@ def test_the_chain_of_emcee_is_taken_up_bit_for_bit(tmp_path: Path):
     assert np.any(again.kept()[0][0] != again.kept()[0][1]), "ensembles are independent"
 
 
-def test_a_sampler_of_ones_own_is_thirty_lines():
-    lines = len(OWN_FILE.read_text().splitlines())
-    print(f"random-walk Metropolis: one file of {lines} lines")
-    assert lines <= 40
-
-
 @pytest.mark.long
 def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Path):
     """The whole way, and against emcee on the same surrogate: means to 4 standard errors, widths to 10 %."""
