@@ -29,7 +29,7 @@ from linear_judge import Linear, joined
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
-from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Measured
+from walop_jax.diagnosis.design import LIGHT, SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence, Examination, common_mode, examine
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, sentences_of
@@ -176,7 +176,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
         projected = project_flux(gain * counts, measured.model, measured.known, measured.shared)
         yield name, -projected[measured.used].reshape(-1)
     for name, share in shares.items():
-        yield name, measured.column(np.broadcast_to(share, shape))
+        yield name, measured.column(np.broadcast_to(share, shape), LIGHT)
     turn, narrowed = said["turn of polariser"], said["depolarisation of polariser"] * narrow[exposure]
     polish = (x**3 - 1.5 * x * y + 0.7 * y**2)[point]
     made = {

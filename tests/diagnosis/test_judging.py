@@ -167,10 +167,10 @@ def test_every_block_of_the_free_form_term_answers_to_a_stratum(leaking):
     measured = Measured(extended.likelihood, extended.values)
     blocks = {stratum.name: stratum.block for stratum in strata(measured)}
     assert set(blocks.values()) == {*BLOCKS, ""}
-    assert blocks["4θ of O1"] == "harmonics"
-    assert blocks["rings of E2"] == "fine"
-    assert blocks["kind"] == "exposures"
-    assert blocks["flux"] == ""
+    assert blocks["4θ of O1"] == blocks["4θ of light on O1"] == "harmonics"
+    assert (blocks["rings of E2"], blocks["rings of light on E2"]) == ("fine_gains", "fine")
+    assert (blocks["gain by kind"], blocks["response by kind"]) == ("exposure_gains", "exposures")
+    assert blocks["gain with flux"] == ""
 
 
 def test_many_names_and_weak_errors_call_for_caution():
@@ -200,7 +200,7 @@ def test_what_has_no_name_stays_unexplained_and_is_carried_along():
     calset, _ = simulate(plan, seed=5, effects=[dataclasses.replace(pattern, harmonics=waves)])
     found = diagnose(calset)
     assert found.verdict == "unexplained"
-    assert "4θ of O1" in found.unexplained.description
+    assert "4θ of light on O1" in found.unexplained.description
     assert "harmonics" in found.unexplained.free_form
     assert found.unexplained.chi2_after < found.unexplained.chi2_before
     assert found.after.explains_data

@@ -31,10 +31,14 @@ def dense(design: Design, grouping: _Grouping) -> np.ndarray:
     measured, columns = design.measured, []
     for place in np.unique(grouping.place[grouping.place >= 0]):
         for k in range(measured.cameras):
-            for feature in np.moveaxis(grouping.features, -1, 0):
+            # A gain multiplies the counts of the model, a response adds a share of the mean counts of the camera.
+            mean = measured.level[:, None, :] * measured.weight
+            changed = [(measured.model, feature) for feature in np.moveaxis(grouping.gains, -1, 0)]
+            changed += [(mean, feature) for feature in np.moveaxis(grouping.responses, -1, 0)]
+            for counts, feature in changed:
                 change = np.zeros_like(measured.model)
                 here = measured.flux * feature * (grouping.place == place)
-                change[..., k] = here * measured.model[..., k]
+                change[..., k] = here * counts[..., k]
                 left = project_flux(change, measured.model, measured.known, measured.shared)
                 rows = np.zeros(len(design.residual))
                 rows[: design.rows] = left[measured.used].reshape(-1)

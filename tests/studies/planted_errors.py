@@ -162,6 +162,10 @@ ERRORS = (
     planted("science/polarisation.py", "np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)",
             "np.mod(np.rad2deg(0.5 * np.arctan2(q, u)), 180.0)", "science/test_polarisation.py"),
     # diagnosis
+    planted("diagnosis/design.py", "unit = self.model if sort == GAIN else", "unit = self.model if sort == LIGHT else",
+            "diagnosis/test_gain_and_light.py"),
+    planted("diagnosis/variance_components.py", "((GAIN, grouping.gains), (LIGHT, ", "((GAIN, grouping.gains), (GAIN, ",
+            "diagnosis/test_variance_components.py"),
     planted("diagnosis/refits.py", "0.5 * (squares[0] - squares[1])", "0.5 * (squares[1] - squares[0])",
             "diagnosis/test_kinds_predict.py"),
     planted("diagnosis/score.py", "amplitudes=-w @ z", "amplitudes=w @ z", "diagnosis/test_score.py"),

@@ -1,22 +1,29 @@
 """One fit laid out for linear algebra: residuals, Jacobian, priors as rows, and where every row comes from.
 
-Patterns without a name describe possible disagreements of any instrument of this kind. Each stratum perturbs
-the counts of the cameras, N_k → N_k + F · pattern, and is one candidate of the score test:
+Patterns without a name describe possible disagreements of any instrument of this kind. Each stratum holds patterns of
+one sort, in one camera or in all of them, and is one candidate of the score test. A pattern perturbs the counts of a
+camera k in one of two ways, which differ most where polarised light leaves the camera dark:
 
-vector          one element (q or u) of the analysis vector of one camera × field polynomials up to degree 4:
-                anything linear in the light (a Mueller effect) that is smooth in the field
-harmonic        1θ, 3θ, 4θ, 5θ, 6θ of the polariser angle in one camera × field polynomials up to degree 1: what no
-                Mueller matrix behind the polariser can make
-time, flux, temperature   gain of a camera linear in that quantity
-kind, filter, plate       response of a camera that differs between kinds of exposure, filters, plate settings;
-                for kinds also gradients over the field
-exposure        gain of each camera in each single exposure, where it is seen at several field points
-state           gain of each camera in each state, the same in all filters, where there are several: a state is all
+gain            N_k → N_k (1 + a · pattern): the camera answers with a larger share of the counts that it has. Dust, a
+                flat field, an amplifier: where the camera is dark, nothing changes.
+light           N_k → N_k + a · F · L_k · pattern: light is added, whatever the polarisation of the light through the
+                polariser. A ghost, a reflection, a background that follows the flux: a dark camera sees it best.
+
+vector          light, in proportion to q or u: one element of the analysis vector of one camera × field polynomials up
+                to degree 4: anything linear in the light (a Mueller effect) that is smooth in the field
+harmonic        gain and light: 1θ, 3θ, 4θ, 5θ, 6θ of the polariser angle in one camera × field polynomials up to
+                degree 1: what no Mueller matrix behind the polariser can make
+fine structure  gain and light × field polynomials of degree 5 to 8
+rings           gain and light × polynomials of the squared field radius, of degree 3 to 8 in it
+time, flux, temperature   gain and light of all cameras, linear in that quantity
+kind, filter, plate       the response to I, q and u (light), and the gain, of all cameras, between kinds of exposure,
+                filters, plate settings; for kinds also gradients over the field, of gain and of light
+single exposures          gain, and light, of each camera in each exposure, where it is seen at several field points
+states          gain of each camera in each state, the same in all filters, where there are several: a state is all
                 exposures that differ in nothing but the filter
-fine structure  gain of a camera × field polynomials of degree 5 to 8
-rings           gain of a camera × polynomials of the squared field radius, of degree 3 to 8 in it
 
-The columns carry the unit "share of the unpolarised counts of the camera".
+Amplitudes have no unit: they are shares of the counts (gain), or of the mean counts L_k of the camera over the
+exposures of the field point, for light of unit flux (light).
 
 Scores of all patterns against a fit (`pattern_scores`) come from one number for each exposure at a point instead of
 each intensity.
@@ -24,9 +31,10 @@ each intensity.
 Equation    A pattern of camera k changes the counts of that camera alone: its column is v (e_k − m m_k) in every row,
                 C_aᵀC_b = Σ v_a v_b (δ_kl − m_k m_l),   QᵀC_a = Σ v_a (Q_k − m_k (m·Q))
             and behind the base G = CᵀC − (QᵀC)ᵀ(QᵀC).
-Symbols     a, b patterns of the cameras k, l; v = flux × unpolarised counts per flux / error × pattern; m = expected
-            counts / errors of all with a flux in common, of unit length, 0 where the flux is known; Q orthonormal basis
-            of the derivatives with respect to the free parameters
+Symbols     a, b patterns of the cameras k, l; v = change of the counts / error, for a gain expected counts × pattern /
+            error, for light F L_k × pattern / error; m = expected counts / errors of all with a flux in common, of
+            unit length, 0 where the flux is known; Q orthonormal basis of the derivatives with respect to the free
+            parameters
 Limits      The difference leaves 10⁻¹⁶ of the square of a column; what has less than `score.ABSORBED` left plays no
             part. Where exposures have a flux in common their rows hang together, and all columns are written out.
 """
@@ -35,6 +43,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import enum
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -62,6 +71,15 @@ MANY_POINTS = 4
 """Field points of an exposure, on average, above which its cameras may have gains of their own: with fewer there are
 nearly as many gains as data."""
 
+
+class Sort(enum.StrEnum):
+    """The two ways in which a pattern changes the counts of a camera: multiplied by a gain, or with light added."""
+
+    GAIN = "gain"
+    LIGHT = "light"
+
+
+GAIN, LIGHT = Sort.GAIN, Sort.LIGHT
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
@@ -90,13 +108,22 @@ class Measured:
         count = np.maximum(self.used.sum(axis=1), 1)[:, None]
         self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / count
 
-    def column(self, pattern: Cube) -> Float[np.ndarray, " _"]:
-        """Derivative of the residuals with respect to the amplitude of N_k → N_k + F · level_k · pattern."""
-        return self.derivative(self.flux[..., None] * pattern * self.level[:, None, :])
+    def counts_changed_by(self, sort: Sort) -> Cube:
+        """Counts, in standard errors, that a pattern of 1 everywhere adds to every camera as a gain, or as light."""
+        unit = self.model if sort == GAIN else self.level[:, None, :] * self.weight
+        return self.flux[..., None] * unit
+
+    def column(self, pattern: Cube, sort: Sort) -> Float[np.ndarray, " _"]:
+        """Derivative of the residuals with respect to the amplitude of a pattern of gains, or of light."""
+        return self._projected(self.counts_changed_by(sort) * pattern)
 
     def derivative(self, change: Cube) -> Float[np.ndarray, " _"]:
-        """Derivative of the residuals with respect to the amplitude of N_k → N_k + change."""
-        projected = project_flux(change * self.weight, self.model, self.known, self.shared)
+        """Derivative of the residuals with respect to the amplitude of N_k → N_k + change, a change in counts."""
+        return self._projected(change * self.weight)
+
+    def _projected(self, change: Cube) -> Float[np.ndarray, " _"]:
+        """Derivative with respect to the amplitude of a change of the counts in standard errors: fluxes follow it."""
+        projected = project_flux(change, self.model, self.known, self.shared)
         return -projected[self.used].reshape(-1)
 
     @property
@@ -127,13 +154,15 @@ class Measured:
 
     def changes(self, strata: Sequence[_Stratum]) -> Float[np.ndarray, "r a"]:
         """Change by every pattern in its camera in every used row, in standard errors, the flux held."""
-        size = (self.flux[..., None] * self.level[:, None, :] * self.weight)[self.used]
+        sizes = {sort: self.counts_changed_by(sort)[self.used] for sort in (GAIN, LIGHT)}
         points, exposures = np.nonzero(self.used)
-        pairs = itertools.chain(*(zip(s.camera, s.patterns, strict=True) for s in strata))
-        changes = np.empty((len(size), sum(len(s.camera) for s in strata)), order="F")
-        for a, (k, pattern) in enumerate(pairs):
-            values = np.broadcast_to(pattern, self.used.shape)[points, exposures]
-            np.multiply(size[:, k], values, out=changes[:, a])
+        changes = np.empty((len(points), sum(len(s.camera) for s in strata)), order="F")
+        column = 0
+        for stratum in strata:
+            for k, pattern in zip(stratum.camera, stratum.patterns, strict=True):
+                values = np.broadcast_to(pattern, self.used.shape)[points, exposures]
+                np.multiply(sizes[stratum.sort][:, k], values, out=changes[:, column])
+                column += 1
         return changes
 
     def candidate(self, stratum: _Stratum) -> Candidate:
@@ -148,17 +177,22 @@ class Measured:
             columns = columns.reshape(-1, len(camera))
         else:
             patterns = zip(camera, stratum.patterns, strict=True)
-            columns = np.column_stack([self.column(pattern[..., None] * unit[k]) for k, pattern in patterns])
+            columns = np.column_stack(
+                [self.column(pattern[..., None] * unit[k], stratum.sort) for k, pattern in patterns]
+            )
         return Candidate(stratum.name, columns, stratum.widths, stratum.block)
 
 
 class _Stratum(NamedTuple):
-    """Patterns of gains of single cameras, each of shape (points or 1, exposures or 1), and the camera of each.
+    """Patterns of single cameras, each of shape (points or 1, exposures or 1), and the camera of each.
 
-    `block` is the block of the free-form term that can take it up.
+    `sort` is that of all patterns: "gain" or "light". `block` is the block of the free-form term that can take them up.
+    Example: "fine structure of E1" holds 30 patterns over the field of the gain of camera E1, "fine structure of light
+    on E1" the same patterns of light added to the counts of E1.
     """
 
     name: str
+    sort: Sort
     camera: Sequence[int]
     patterns: Sequence[Pattern]
     block: str = ""
@@ -169,22 +203,32 @@ class _Stratum(NamedTuple):
         return np.full(len(self.camera), WIDTH)
 
 
-def _in_each(cameras: Sequence[int], name: str, patterns: Sequence[Pattern], block: str = "") -> _Stratum:
+def _in_each(
+    cameras: Sequence[int], name: str, sort: Sort, patterns: Sequence[Pattern], block: str = ""
+) -> _Stratum:
     """Each pattern in each of these cameras."""
     pairs = list(itertools.product(patterns, cameras))
-    return _Stratum(name, [k for _, k in pairs], [pattern for pattern, _ in pairs], block)
+    return _Stratum(name, sort, [k for _, k in pairs], [pattern for pattern, _ in pairs], block)
+
+
+def pattern_in_words(name: str, cameras: Sequence[str]) -> str:
+    """The name of a pattern for a reader: "fine structure of E1" is fine structure of the gain of E1, not of light."""
+    what, of, camera = name.rpartition(" of ")
+    is_gain = camera in cameras and not what.startswith("vector")
+    return f"{what}{of}the gain of {camera}" if is_gain else name
 
 
 def number_of_columns(calset: CalibrationSet, instrument: Instrument) -> int:
     """Number of columns of all strata together, or a few more."""
     e, cameras = calset.exposures, len(instrument.cameras)
     turning = 1 + len(instrument.patched().moving())
-    of_camera = 2 * len(legendre.terms(SMOOTH)) + len(legendre.terms(FINE)) + len(thresholds.RINGS)
-    of_camera += 6 * len(HARMONICS) * turning + 3  # time, temperature, flux
-    of_camera += 5 * (len(np.unique(e.kind)) - 1) + 3 * (len(np.unique(e.filter)) - 1)
+    of_camera = 2 * len(legendre.terms(SMOOTH))
+    # Gain and light of each: fine structure, rings, harmonics, then time, temperature and flux.
+    of_camera += 2 * (len(legendre.terms(FINE)) + len(thresholds.RINGS) + 6 * len(HARMONICS) * turning + 3)
+    of_camera += 8 * (len(np.unique(e.kind)) - 1) + 4 * (len(np.unique(e.filter)) - 1)
     for prefix in instrument.patched().moving():
-        of_camera += 3 * (len(np.unique(positions_of(e, prefix))) - 1)
-    gains = (len(e) + int(states(calset).max()) + 1) * (cameras - instrument.cameras.fluxes)
+        of_camera += 4 * (len(np.unique(positions_of(e, prefix))) - 1)
+    gains = (2 * len(e) + int(states(calset).max()) + 1) * (cameras - instrument.cameras.fluxes)
     return cameras * of_camera + gains
 
 
@@ -213,7 +257,7 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
     for k, camera in enumerate(names):
         for i, element in ((1, "q"), (2, "u")):
             patterns = [term[:, None] * stokes[..., i] for term in smooth.T]
-            yield _in_each([k], f"vector {element} of {camera}", patterns, "vectors")
+            yield _in_each([k], f"vector {element} of {camera}", LIGHT, patterns, "vectors")
         for symbol, prefix in turning:
             position = e.position(prefix)
             through = position.inside & measured.used.any(axis=0)
@@ -223,14 +267,18 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
                     continue
                 waves = [np.where(through, wave(harmonic * angle), 0.0) for wave in (np.cos, np.sin)]
                 patterns = [term[:, None] * wave for term in smooth.T[:3] for wave in waves]
+                # A gain that follows hθ makes light that follows (h − 2)θ, hθ and (h + 2)θ of a polarised beam.
                 block = "harmonics" if prefix == POLARISER else "exposures"
-                yield _in_each([k], f"{harmonic}{symbol} of {camera}", patterns, block)
-        yield _in_each([k], f"fine structure of {camera}", [t[:, None] for t in fine.T], "fine")
-        yield _in_each([k], f"rings of {camera}", [ring[:, None] for ring in rings.T], "fine")
-    for name, quantity, block in (
-        ("time", e.mjd[None, :], "exposures"),
-        ("temperature", e.temp[None, :], "exposures"),
-        ("flux", measured.flux, ""),
+                for sort, where in ((GAIN, camera), (LIGHT, f"light on {camera}")):
+                    yield _in_each([k], f"{harmonic}{symbol} of {where}", sort, patterns, block)
+        for sort, where, block in ((GAIN, camera, "fine_gains"), (LIGHT, f"light on {camera}", "fine")):
+            yield _in_each([k], f"fine structure of {where}", sort, [t[:, None] for t in fine.T], block)
+            yield _in_each([k], f"rings of {where}", sort, [ring[:, None] for ring in rings.T], block)
+    by_exposure, none = {GAIN: "exposure_gains", LIGHT: "exposures"}, {GAIN: "", LIGHT: ""}
+    for name, quantity, blocks in (
+        ("time", e.mjd[None, :], by_exposure),
+        ("temperature", e.temp[None, :], by_exposure),
+        ("flux", measured.flux, none),
     ):
         measured_values = quantity[measured.used] if quantity.shape == measured.used.shape else quantity
         if not np.isfinite(measured_values).any():
@@ -238,29 +286,35 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
         quantity = quantity - np.nanmean(measured_values)
         spread = np.nanstd(quantity)
         if np.isfinite(spread) and spread > 1e-9 * max(1.0, float(np.nanmax(np.abs(quantity)))):
-            yield _in_each(all_cameras, name, [np.nan_to_num(quantity / spread)], block)
+            pattern = np.nan_to_num(quantity / spread)
+            for sort in (GAIN, LIGHT):
+                yield _in_each(all_cameras, f"{sort} with {name}", sort, [pattern], blocks[sort])
     positions = [(prefix.lower(), positions_of(e, prefix)) for prefix in measured.likelihood.plan.moving]
-    for name, label, block in (
-        ("kind", e.kind, "exposures"),
-        ("filter", e.filter, ""),
-        *((("plate" if prefix == "chwp" else prefix), label, "") for prefix, label in positions),
+    for name, label, blocks in (
+        ("kind", e.kind, by_exposure),
+        ("filter", e.filter, none),
+        *((("plate" if prefix == "chwp" else prefix), label, none) for prefix, label in positions),
     ):
-        groups = itertools.product(np.unique(label)[1:], range(3))
-        patterns = [np.where(label == group, stokes[..., i], 0.0) for group, i in groups]
-        if patterns:
-            yield _in_each(all_cameras, name, patterns, block)
+        members = [label == group for group in np.unique(label)[1:]]
+        if members:
+            responses = [np.where(member, stokes[..., i], 0.0) for member in members for i in range(3)]
+            yield _in_each(all_cameras, f"response by {name}", LIGHT, responses, blocks[LIGHT])
+            gains = [np.where(member, 1.0, 0.0)[None] for member in members]
+            yield _in_each(all_cameras, f"gain by {name}", GAIN, gains, blocks[GAIN])
     groups = itertools.product(np.unique(e.kind)[1:], smooth.T[1:3])
-    sky_gradients = [np.where(e.kind == group, term[:, None], 0.0) for group, term in groups]
-    if sky_gradients:
-        yield _in_each(all_cameras, "kind, over the field", sky_gradients)
+    gradients = [np.where(e.kind == group, term[:, None], 0.0) for group, term in groups]
+    if gradients:
+        for sort in (GAIN, LIGHT):
+            yield _in_each(all_cameras, f"{sort} by kind, over the field", sort, gradients)
     if measured.has_gains:
         alone = list(np.eye(len(e))[:, None])
-        yield _in_each(measured.gained, SINGLE_EXPOSURES, alone, "exposures")
+        yield _in_each(measured.gained, SINGLE_EXPOSURES, GAIN, alone, "exposure_gains")
+        yield _in_each(measured.gained, f"light in {SINGLE_EXPOSURES}", LIGHT, alone, "exposures")
     state = states(measured.likelihood.calset)
     several = np.unique(state) if len(np.unique(state)) < len(state) else ()
     if len(several) and measured.gained:
         patterns = [np.where(state == number, 1.0, 0.0)[None] for number in several]
-        yield _in_each(measured.gained, STATES, patterns)
+        yield _in_each(measured.gained, STATES, GAIN, patterns)
 
 
 # ----------------------------------------------------------------------------------------------------- one fit laid out

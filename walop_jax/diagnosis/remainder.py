@@ -14,7 +14,7 @@ from scipy import special
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import Design, held_out, strata
+from walop_jax.diagnosis.design import Design, held_out, pattern_in_words, strata
 from walop_jax.diagnosis.exact import Trial, context_of, evidence_of_presence, log_evidence_ratio, try_effect
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.findings import Unexplained, describe
@@ -155,10 +155,11 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     result, measured = evidence.result, evidence.design.measured
     remainder = _unexplained(evidence)
     blocks = dict.fromkeys(
-        block for name, _ in remainder.patterns if (block := evidence.candidates[name].block)
+        block for name, _ in evidence.beside_patterns[0] if (block := evidence.candidates[name].block)
     )
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
-        blocks.pop("exposures", None)
+        for block in ("exposures", "exposure_gains"):
+            blocks.pop(block, None)
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
         return remainder, None
     # A block has all patterns of its kind: those that are not needed cost errors as well.
@@ -180,7 +181,8 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
 
 def _unexplained(evidence: Examination) -> Unexplained:
     """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
-    patterns = tuple(evidence.beside_patterns[0])
+    cameras = evidence.result.model.template.cameras.names
+    patterns = tuple((pattern_in_words(name, cameras), p) for name, p in evidence.beside_patterns[0])
     if not evidence.alarm:
         ratio = evidence.chi2 / evidence.dof
         text = f"residuals scatter more than N_ERR (χ²/dof = {ratio:.3g}) without a known pattern"

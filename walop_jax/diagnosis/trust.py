@@ -40,7 +40,7 @@ from scipy import linalg, special
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
-from walop_jax.diagnosis.design import Design, pattern_scores
+from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
@@ -115,7 +115,11 @@ def examined(
         hidden = hidden_mistakes(design, singles)
         doubts = (
             *stated_conditions(design, singles),
-            *_significant("hold patterns that noise does not make", pattern_scores(design, seed)),
+            *_significant(
+                "hold patterns that noise does not make",
+                pattern_scores(design, seed),
+                result.model.template.cameras.names,
+            ),
             *_significant(
                 "are explained better by a missing effect",
                 candidates or candidate_scores(design, seed, singles),
@@ -279,10 +283,11 @@ def sampled(result: FitResult, most: int = 0) -> FitResult:
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
 
 
-def _significant(finding: str, table: ScoreTable) -> Iterator[str]:
-    """A doubt if the lowest p-value of a table is below the threshold."""
+def _significant(finding: str, table: ScoreTable, cameras: Sequence[str] = ()) -> Iterator[str]:
+    """A doubt if the lowest p-value of a table is below the threshold; `cameras` where its candidates are patterns."""
     if table.p_global < thresholds.ALARM:
-        names = " | ".join(table.significant(thresholds.ALARM, thresholds.SHOWN))
+        found = table.significant(thresholds.ALARM, thresholds.SHOWN)
+        names = " | ".join(pattern_in_words(name, cameras) for name in found)
         yield (
             f"the residuals {finding} (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}; nearest: {names}): "
             "walop-jax diagnose looks for the cause"

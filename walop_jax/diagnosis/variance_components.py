@@ -18,7 +18,8 @@ that with B = QᵀA and D what the fluxes leave of AᵀA, block by block,
 Groupings   the gain of each camera, and its response to each Stokes parameter, at each field point (structure finer
             than any polynomial: flat fields, dust, pixels); its gain and gradients over the field in each exposure;
             its response to each Stokes parameter in each state of the moving elements; its gain and gradients for
-            each night and kind of exposure; its gain and response to each Stokes parameter for each standard
+            each night and kind of exposure; its gain and response to each Stokes parameter for each standard. A gain
+            multiplies the counts of an exposure; a response adds light, as a change of an analysis vector does
 Symbols     r whitened residuals; w expected counts / errors of what has a flux in common, of unit length; Q orthonormal
             basis of the derivatives with respect to the free parameters; τ a share of the counts
 Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 84, 309. Three moments: Imhof 1961,
@@ -51,7 +52,7 @@ from jaxtyping import Float, Int
 from scipy import special
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.design import GAIN, LIGHT, Design
 from walop_jax.diagnosis.score import local_p
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import STATED, Structure
@@ -67,15 +68,17 @@ WITH_STRUCTURE = "N_ERR with structure of field points"
 class _Grouping(NamedTuple):
     """A way of grouping the data, and the quantities that may differ from place to place.
 
-    `place` is the number of the place of every (point, exposure), −1 for none; the gain of a camera there is multiplied
-    with each of the `features`. `words` say what agrees; `structure` names the field of `Structure` that its size is,
-    where a place is one field point.
+    `place` is the number of the place of every (point, exposure), −1 for none. There a camera has a gain for each of
+    the `gains`, which multiplies its counts, and sees more light for each of the `responses`, in proportion to its mean
+    counts: q and u as responses are changes of the analysis vector. `words` say what agrees; `structure` names the
+    field of `Structure` that its size is, where a place is one field point.
     """
 
     name: str
     words: str
     place: Int[np.ndarray, "p e"]
-    features: Float[np.ndarray, "p e j"]
+    gains: Float[np.ndarray, "p e g"]
+    responses: Float[np.ndarray, "p e j"]
     structure: str = ""
 
 
@@ -154,7 +157,7 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     """The groupings that the data have; of two that cut them alike, the first."""
     measured, calset = design.measured, design.fit.calset
     e, points, used = calset.exposures, calset.points, measured.used
-    constant = np.ones((*used.shape, 1))
+    constant, nothing = np.ones((*used.shape, 1)), np.zeros((*used.shape, 0))
     stokes = measured.likelihood.stokes(measured.values)[..., 1:3]
     reach = max(float(np.hypot(points.x, points.y).max(initial=0.0)), 1e-12)
     plane = np.stack([np.ones(len(points)), points.x / reach, points.y / reach], axis=-1)
@@ -166,9 +169,9 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     at_points = np.where(number % stride == 0, number // stride, -1)[:, None]
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
-        yield _Grouping(f"{point}s", agree, at_points, constant, "gain")
+        yield _Grouping(f"{point}s", agree, at_points, constant, nothing, "gain")
         agree_in_qu = f"{agree} in q and u"
-        yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, stokes, "response")
+        yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, nothing, stokes, "response")
     if pixels:
         return
     moving = map(e.position, design.fit.likelihood.plan.moving)
@@ -176,17 +179,24 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     night = night_of(e.mjd, calset.site.longitude)
     source = calset.intensities.block(0, len(points)).source
     cuts = [np.zeros(used.shape, int)]
-    for name, words, place, features in (
-        ("exposures", "of the same exposure agree between field points", _numbered(e.exposure), plane),
-        ("states", "of the same filter and moving elements agree", _numbered(e.filter, *positions), stokes),
-        ("sources", "of the same standard agree", source, np.concatenate([constant, stokes], axis=-1)),
-        ("nights", "of the same night agree", _numbered(night), plane),
-        ("kinds", "of the same kind of exposure agree", _numbered(e.kind), plane),
+    state = _numbered(e.filter, *positions)
+    for name, words, place, gains, responses in (
+        (
+            "exposures",
+            "of the same exposure agree between field points",
+            _numbered(e.exposure),
+            plane,
+            nothing,
+        ),
+        ("states", "of the same filter and moving elements agree", state, nothing, stokes),
+        ("sources", "of the same standard agree", source, constant, stokes),
+        ("nights", "of the same night agree", _numbered(night), plane, nothing),
+        ("kinds", "of the same kind of exposure agree", _numbered(e.kind), plane, nothing),
     ):
         place = np.broadcast_to(place, used.shape)
         if len(np.unique(place[used])) > 1 and not any(np.array_equal(place, earlier) for earlier in cuts):
             cuts.append(place)
-            yield _Grouping(name, words, place, features)
+            yield _Grouping(name, words, place, gains, responses)
 
 
 def _numbered(*labels: np.ndarray) -> Int[np.ndarray, " e"]:
@@ -254,9 +264,12 @@ def _blocks(
     """D, QᵀA and Aᵀr, place by place; columns are camera × feature. None where a flux belongs to several places."""
     measured = design.measured
     used, shared, cameras = measured.used, measured.shared, measured.cameras
-    place, features = grouping.place[used], grouping.features[used]
-    gain = (measured.flux[..., None] * measured.model)[used] / design.fit.noise_scale
-    change = gain[..., None] * features[:, None, :]
+    place, scale = grouping.place[used], design.fit.noise_scale
+    changes = (
+        (measured.counts_changed_by(sort)[used] / scale)[..., None] * features[used][:, None, :]
+        for sort, features in ((GAIN, grouping.gains), (LIGHT, grouping.responses))
+    )
+    change = np.concatenate(list(changes), axis=-1)
     along = (change * measured.unit_model[..., None]).reshape(len(change), -1)
     group = None
     if shared.exposures is not None:

@@ -5,8 +5,10 @@ Blocks that were not requested have no elements.
 
 Equation    vectors     a_k → a_k + a_k0 · Σ_t v_kst P_t(x, y) e_s, s = q, u: any linear effect smooth in the field
             harmonics   N_k → N_k + N⁰_k · Σ_ht (c_kht cos hθ + s_kht sin hθ) P_t(x, y), θ polariser angle
-            fine        N_k → N_k + N⁰_k · Σ_t f_kt P_t(x, y), P_t of higher degree than the throughput
-            exposures   N_k → N_k + N⁰_k · g_ek
+            fine        N_k → N_k + N⁰_k · Σ_t f_kt P_t(x, y), P_t of higher degree than the throughput: light
+            fine_gains  N_k → N_k · (1 + Σ_t f_kt P_t(x, y)), the same P_t: gains of the cameras
+            exposures   N_k → N_k + N⁰_k · g_ek: light in single exposures
+            exposure_gains  N_k → N_k · (1 + g_ek): gains of the cameras in single exposures
 Symbols     a_k analysis vector of camera k, a_k0 its response to unpolarised light; N_k counts and N⁰_k those of
             unpolarised light of the same flux; P_t products of Legendre polynomials, in the scale
             of the field of the instrument
@@ -36,7 +38,7 @@ from walop_jax.model.sources import ExposureArrays
 WIDTH = 0.003  # plausible size, in units of the response to unpolarised light
 SMOOTH, FINE, GRADIENT = 4, 8, 1  # degrees of the field polynomials
 HARMONICS = (1, 3, 4, 5, 6)
-BLOCKS = ("vectors", "harmonics", "fine", "exposures")
+BLOCKS = ("vectors", "harmonics", "fine", "fine_gains", "exposures", "exposure_gains")
 _SMOOTH_TERMS = legendre.terms(SMOOTH)
 _GRADIENT_TERMS = legendre.terms(GRADIENT)
 _FINE_TERMS = legendre.terms(FINE)[len(_SMOOTH_TERMS) :]
@@ -59,14 +61,17 @@ def _fine(coefficients: Float[Array, "k f"], x: Scalar, y: Scalar, scale: float)
 
 
 class Pattern(Mixing):
-    """Smooth changes of q and u elements, fine changes of the response to unpolarised light."""
+    """Fine gains, smooth changes of q and u elements, fine changes of the response to unpolarised light."""
 
     smooth: Float[Array, "k 2 s"]
-    fine: Float[Array, "c f"]  # one of the two may be empty
+    fine: Float[Array, "c f"]
+    gains: Float[Array, "g f"]  # any of the three may be empty
     scale: float = eqx.field(static=True)  # of the field, degrees
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-        """Add the patterns, relative to the response to unpolarised light."""
+        """Multiply by the gains, and add the patterns relative to the response to unpolarised light."""
+        if self.gains.size:
+            vectors = vectors * (1.0 + _fine(self.gains, x, y, self.scale))[:, None]
         plain = vectors[:, :, 0]
         if self.smooth.size:
             change = self.smooth @ legendre.basis(x, y, SMOOTH, self.scale)
@@ -80,17 +85,24 @@ class FreeShares(ExposurePart):
     """Harmonics of the polariser angle and single exposures."""
 
     harmonics: Float[Array, "c h 2 g"]
-    exposures: Float[Array, "e k"]  # one of the two may be empty
-    fine: Float[Array, "d f"]  # structure beyond the response of the throughput; may be empty
+    exposures: Float[Array, "e k"]
+    gains: Float[Array, "f k"]  # of single exposures; any of the three may be empty
+    fine: Float[Array, "d t"]  # structure beyond the response of the throughput; may be empty
     scale: float = eqx.field(static=True)  # of the field, degrees
 
     @property
     def exposures_known(self) -> int | None:
-        """Number of exposures of the block of single exposures."""
-        return len(self.exposures) or None
+        """Number of exposures of the blocks of single exposures."""
+        return len(self.exposures) or len(self.gains) or None
 
-    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
+    def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
+        """Gains of the cameras in single exposures."""
+        return 1.0 + self.gains if self.gains.size else 1.0
+
+    def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
         """Addition in units of the response to unpolarised light."""
+        if not (self.harmonics.size or self.exposures.size):
+            return 0.0
         total = jnp.zeros(())
         if self.harmonics.size:
             angle = exposures.clp_angle[:, None] * jnp.asarray(HARMONICS)
@@ -107,8 +119,10 @@ class FreeForm(Effect):
 
     vectors: Float[Array, "k 2 s"] = _pattern("change of an analysis vector, relative to its first element")
     harmonics: Float[Array, "k h 2 g"] = _pattern("harmonic of the polariser angle, cos and sin")
-    fine: Float[Array, "k f"] = _pattern("fine structure over the field")
-    exposures: Float[Array, "e k"] = _pattern("one camera in one exposure")
+    fine: Float[Array, "k f"] = _pattern("fine structure of added light over the field")
+    fine_gains: Float[Array, "k f"] = _pattern("fine structure of the gain over the field")
+    exposures: Float[Array, "e k"] = _pattern("light on one camera in one exposure")
+    exposure_gains: Float[Array, "e k"] = _pattern("gain of one camera in one exposure")
     blocks: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "free_form"
@@ -132,7 +146,9 @@ class FreeForm(Effect):
             "vectors": (len(context.cameras), 2, len(_SMOOTH_TERMS)),
             "harmonics": (len(context.cameras), len(HARMONICS), 2, len(_GRADIENT_TERMS)),
             "fine": (len(context.cameras), len(_FINE_TERMS)),
+            "fine_gains": (len(context.cameras), len(_FINE_TERMS)),
             "exposures": (context.exposures, len(context.cameras)),
+            "exposure_gains": (context.exposures, len(context.cameras)),
         }
         zeros = {
             name: jnp.zeros(shape if name in blocks else (0, *shape[1:])) for name, shape in shapes.items()
@@ -147,17 +163,19 @@ class FreeForm(Effect):
             "vectors": (_cameras(shape[0]), "qu", _tags(_SMOOTH_TERMS)),
             "harmonics": (_cameras(shape[0]), waves, _tags(_GRADIENT_TERMS)),
             "fine": (_cameras(shape[0]), _tags(_FINE_TERMS)),
+            "fine_gains": (_cameras(shape[0]), _tags(_FINE_TERMS)),
             "exposures": ([str(i) for i in range(shape[0])], _cameras(shape[1])),
+            "exposure_gains": ([str(i) for i in range(shape[0])], _cameras(shape[1])),
         }[field]
         return [".".join((field, *label)) for label in itertools.product(*parts)]
 
     def patch(self, instrument: Instrument) -> Instrument:
         """Add the blocks: smooth and fine patterns to the cameras, harmonics and single exposures to the exposures."""
         scale = instrument.units.field
-        if self.vectors.size or self.fine.size:
-            instrument = instrument.with_part("mixing", Pattern(self.vectors, self.fine, scale))
-        if self.harmonics.size or self.exposures.size:
-            instrument = instrument.with_part(
-                "exposures", FreeShares(self.harmonics, self.exposures, self.fine, scale)
-            )
+        if self.vectors.size or self.fine.size or self.fine_gains.size:
+            pattern = Pattern(self.vectors, self.fine, self.fine_gains, scale)
+            instrument = instrument.with_part("mixing", pattern)
+        if self.harmonics.size or self.exposures.size or self.exposure_gains.size:
+            shares = FreeShares(self.harmonics, self.exposures, self.exposure_gains, self.fine, scale)
+            instrument = instrument.with_part("exposures", shares)
         return instrument
