@@ -43,6 +43,8 @@ from walop_jax.data.settings import Settings as Settings
 from walop_jax.data.write import write_calibration_set as write_calibration_set
 from walop_jax.fit.base_model import base_model as base_model
 from walop_jax.fit.forward import forward as forward
+from walop_jax.fit.many import ManyFits as ManyFits
+from walop_jax.fit.many import refit_many as refit_many
 from walop_jax.fit.refit import FitResult as FitResult
 from walop_jax.io.errors import DataError as DataError
 from walop_jax.likelihood.forward import Forward as Forward

@@ -21,7 +21,7 @@ Source      `SOURCE`: the method and its trust region.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
@@ -117,11 +117,48 @@ def minimise(
 ) -> Minimum[Place]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
-    `evaluate(x)` gives the objective and its expansion at x, `far_off` whether the model of an expansion is hopelessly
-    far from the data; `secant` is for searches that Gauss–Newton steps alone did not end; `progress(step, expansion)`
-    is given the best one after each of at most `maximum_steps` places, the start among them. Where the last step is not
-    looked at, `scaled_gradient` is the one to be expected, and the expansion that of the place before. Never raises for
-    a numerical outcome: the gates, `result` and `message` say what happened.
+    `evaluate(x)` gives the objective and its expansion at x; everything else is explained in `search_of`.
+    """
+    search = search_of(
+        start,
+        scale,
+        damping=damping,
+        maximum_steps=maximum_steps,
+        tolerance=tolerance,
+        far_off=far_off,
+        secant=secant,
+        progress=progress,
+    )
+    place = next(search)
+    while True:
+        try:
+            place = search.send(evaluate(place))
+        except StopIteration as end:
+            return end.value
+
+
+def search_of(
+    start: Vector,
+    scale: Vector,
+    *,
+    damping: float = 1.0,
+    maximum_steps: int = MAXIMUM_STEPS,
+    tolerance: float = TOLERANCE,
+    far_off: Callable[[Place], bool] = lambda _: False,
+    secant: bool = False,
+    progress: Callable[[int, Place], None] | None = None,
+) -> Generator[Vector, Place, Minimum[Place]]:
+    """The search for the minimum of a sum of squares, one place at a time: it asks for places, it is sent expansions.
+
+    It yields the next place that it wants to know about, is sent the objective and its expansion there, and returns the
+    minimum. Whoever drives it decides how a place is evaluated: `minimise` asks a function, `fit.many` evaluates the
+    places of many searches in one program.
+
+    `scale` is the unit of each parameter; `far_off` says whether the model of an expansion is hopelessly far from the
+    data; `secant` is for searches that Gauss–Newton steps alone did not end; `progress(step, expansion)` is given the
+    best one after each of at most `maximum_steps` places, the start among them. Where the last step is not looked at,
+    `scaled_gradient` is the one to be expected, and the expansion that of the place before. Never raises for a
+    numerical outcome: the gates, `result` and `message` say what happened.
     """
     x = trial = np.asarray(start, float)
     size = 1.0 / damping if damping > 0 else np.inf
@@ -130,7 +167,7 @@ def minimise(
     distance, before, condition = np.inf, np.inf, np.inf
     result = RESULTS.nonlinear_max_steps_reached
     while len(history) < maximum_steps:
-        candidate = evaluate(trial)
+        candidate = yield trial
         history.append(candidate.objective)
         if current is None and not np.isfinite(candidate.objective):
             current, result = candidate, RESULTS.nonfinite

@@ -307,7 +307,7 @@ def _residuals(
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
-def _linearised_residuals(
+def residuals_and_slopes(
     instrument: Instrument, plan: Plan, data: PointData
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
     """All residuals and their derivatives with respect to all parameters: for tables, not for whole frames."""
@@ -326,7 +326,7 @@ incoming = compiled(jax.vmap(_incoming, (None, None, 0)), kept_as="incoming")
 """Stokes vectors that enter the collimator."""
 _table_equations = compiled(_on_table, kept_as="table_equations")
 linearised_residuals = compiled(
-    _linearised_residuals, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"
+    residuals_and_slopes, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"
 )
 star_responses = compiled(_star_responses, kept_as="star_responses")
 residuals = compiled(_residuals, optimised_above=limits.OPTIMISED_ABOVE, kept_as="residuals")

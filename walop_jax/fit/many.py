@@ -1,0 +1,353 @@
+"""Joint fits of many sets of one layout by one compiled program: noise realisations, bootstrap, nights, other draws.
+
+Each fit is the one that `refit.fit` makes: the same minimum, sought by the same steps (`minimise.search_of`), fluxes
+eliminated, priors and ties as in the model. What differs is only who evaluates: in every round, the places that all
+unfinished searches ask for go through one program together, which loops over the fits. Nothing is compiled a second
+time, and a set costs no more than its steps.
+
+Layout      sets are of one layout if their plans have the same structure: as many exposures, field points, cameras,
+            bands and settings of the moving elements, whatever the numbers. Numbers that are the same in all sets are
+            in the program once.
+Start       the first set begins at the start values of the model, as `refit.fit` does; all others begin at its minimum,
+            from which they are a few steps away.
+Left over   a search that does not end, or ends far from the data (χ²/dof above `search.FAR_OFF`), is made anew by
+            `refit.fit`, which scales errors and tries plates one order of retardance away; `ManyFits.alone` names it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from walop_jax.data.records import CalibrationSet
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.minimise import Minimum, search_of
+from walop_jax.fit.refit import FitResult, covariance, fit
+from walop_jax.fit.search import FAR_OFF, free_scales
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.errors import fail
+from walop_jax.io.plain_tables import astropy_table
+from walop_jax.likelihood import engine
+from walop_jax.likelihood.engine import Normal, PointData
+from walop_jax.likelihood.layout import PointReader
+from walop_jax.likelihood.likelihood import DataTerms, Expansion, Likelihood, MeasuredPoints, OpticsUsed
+from walop_jax.model.compiled import array, compiled
+from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import with_values
+from walop_jax.model.plan import Plan
+from walop_jax.model.specification import Model
+
+TOGETHER = 32
+"""Fits that one call of the program evaluates: the last call of a round is filled up with copies of its last fit."""
+
+FACTS = ("exposures", "points", "sources", "filters", "site")
+"""What the plan of a set depends on, beside the model."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class ManyFits(Displayed):
+    """Fits of many sets of one layout, in the order of the sets.
+
+    `fits` are ordinary results whose residuals are not examined (`trusted` needs `walop.refit`); `alone` are the
+    positions of those that were fitted by themselves, because the common search did not end near the data. `seconds` is
+    the time that all of them took.
+
+    >>> fits = walop.refit_many([calset, calset])
+    >>> fits.values.shape == (2, len(fits.names))
+    True
+    """
+
+    fits: tuple[FitResult, ...]
+    alone: tuple[int, ...]
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __getitem__(self, number: int) -> FitResult:
+        return self.fits[number]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.fits[0].model.names
+
+    @property
+    def values(self) -> Float[np.ndarray, "s n"]:
+        """Values of all parameters, set by set, in the units of the parameters."""
+        return np.stack([one.values for one in self.fits])
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "s n"]:
+        """Standard errors of all parameters as each fit states them; 0 for frozen ones."""
+        return np.stack([one.sigma for one in self.fits])
+
+    @property
+    def chi2(self) -> Float[np.ndarray, " s"]:
+        """χ² of data and priors of each fit."""
+        return np.array([one.chi2 for one in self.fits])
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " s"]:
+        """True for the fits that reached a well-conditioned minimum."""
+        return np.array([one.converged for one in self.fits])
+
+    def to_table(self) -> Any:
+        """An astropy table with a row for each parameter: mean, scatter and mean stated error over the converged fits.
+
+        SCATTER is the standard deviation from fit to fit. RATIO, of the scatter to the stated error, is 1 where the
+        sets are noise realisations and the stated errors are right, but smaller for a parameter that a prior holds.
+        """
+        converged, model = self.converged, self.fits[0].model
+        values, stated = self.values[converged], self.sigma[converged]
+        scatter = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(len(self.names), np.nan)
+        error = np.sqrt(np.mean(stated**2, axis=0)) if len(values) else np.full(len(self.names), np.nan)
+        mean = values.mean(axis=0) if len(values) else np.full(len(self.names), np.nan)
+        return astropy_table(
+            {
+                "NAME": (np.array(self.names), "", "parameter"),
+                "UNIT": (np.array([p.unit for p in model.parameters]), "", "unit of the numbers of this row"),
+                "MEAN": (mean, "", "mean over the converged fits"),
+                "SCATTER": (scatter, "", "standard deviation from fit to fit"),
+                "ERROR": (error, "", "stated standard error, root mean square over the fits"),
+                "RATIO": (
+                    np.divide(scatter, error, out=np.full(len(error), np.nan), where=error > 0),
+                    "",
+                    "",
+                ),
+            }
+        )
+
+    def display(self) -> Display:
+        """How many fits there are, how many converged, and which were fitted alone."""
+        count = len(self)
+        facts = {
+            "converged": f"{int(self.converged.sum())} of {count}",
+            "χ²/dof": f"{np.median([one.chi2 / max(one.dof, 1) for one in self.fits]):.4g} (median)",
+            "steps": f"{np.median([one.minimum.steps for one in self.fits]):.0f} (median)",
+        }
+        notes = [f"fit {n}: {self.fits[n].minimum.message}" for n in np.flatnonzero(~self.converged)[:5]]
+        if self.alone:
+            listed = ", ".join(map(str, self.alone[:10])) + (", …" if len(self.alone) > 10 else "")
+            notes.append(f"fitted by themselves, as their common search did not end near the data: {listed}")
+        title = f"Fits of {count} sets: {self.fits[0].model.name}"
+        return Display(title, tuple(facts.items()), (), (), (*notes, "to_table() has mean and scatter"))
+
+
+def refit_many(
+    calsets: Sequence[CalibrationSet],
+    model: Model | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> ManyFits:
+    """The joint fit of each of many sets of one layout, in seconds for hundreds of them.
+
+    `model` serves all sets (None: `walop.base_model` of the first). Each fit equals `walop.refit` of its own set, but
+    its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter of every
+    parameter beside its stated error,
+
+    >>> walop.refit_many(realisations).to_table()["NAME", "SCATTER", "ERROR"]  # doctest: +SKIP
+
+    Raises `DataError` for no sets, for a set of another layout than the first one (with its position), and for whole
+    frames; ValueError where exposures cannot determine the instrument.
+    """
+    began = time.perf_counter()
+    if not calsets:
+        raise fail("there are no sets to fit", advice="give at least one calibration set")
+    model = model or base_model(calsets[0])
+    likelihoods = _likelihoods(calsets, model)
+    stack = Stack.of([_inputs(one) for one in likelihoods])
+    first = fit(likelihoods[0])
+    found = {0: first.minimum}
+    searches = {
+        n: search_of(
+            first.values[model.free],
+            free_scales(model),
+            damping=0.0,  # the minimum of the first set is near: Newton steps, until one of them leads upwards
+            far_off=_is_far_off,
+        )
+        for n in range(1, len(likelihoods))
+    }
+    found |= _driven(searches, stack, likelihoods, first.values, progress)
+    results = [first]
+    alone = []
+    for n in range(1, len(likelihoods)):
+        minimum, likelihood = found[n], likelihoods[n]
+        if minimum.converged and not _is_far_off(minimum.expansion):
+            results.append(
+                FitResult(
+                    likelihood=likelihood,
+                    values=minimum.x,
+                    covariance=covariance(model, minimum.expansion),
+                    expansion=minimum.expansion,
+                    minimum=minimum,
+                    seconds=0.0,
+                )
+            )
+        else:
+            alone.append(n)
+            results.append(fit(likelihood))
+    return ManyFits(tuple(results), tuple(alone), time.perf_counter() - began)
+
+
+def _is_far_off(expansion: Expansion) -> bool:
+    """True where the model is so far from the data that `refit.fit` scales their errors."""
+    return not expansion.misfit < FAR_OFF
+
+
+def _driven(
+    searches: dict[int, Any],
+    stack: Stack,
+    likelihoods: Sequence[Likelihood],
+    others: Float[np.ndarray, " n"],
+    progress: Callable[[str], None] | None,
+) -> dict[int, Minimum[Expansion]]:
+    """The minima of searches by their position; `others` are the values of the parameters that are not free."""
+    found: dict[int, Minimum[Expansion]] = {}
+    model = likelihoods[0].model
+    places = {n: next(search) for n, search in searches.items()}
+    while places:
+        if progress is not None:
+            progress(f"{len(found)} of {len(searches)} fits have ended")
+        numbers = list(places)
+        values = np.stack([model.full(places[n], others) for n in numbers])
+        expansions = _expansions(stack, likelihoods, numbers, values)
+        places = {}
+        for n, expansion in zip(numbers, expansions, strict=True):
+            try:
+                places[n] = searches[n].send(expansion)
+            except StopIteration as end:
+                found[n] = dataclasses.replace(end.value, x=model.full(end.value.x, others))
+    return found
+
+
+def _expansions(
+    stack: Stack, likelihoods: Sequence[Likelihood], numbers: Sequence[int], values: Float[np.ndarray, "s n"]
+) -> Iterator[Expansion]:
+    """The expansion of each of some fits at its own values."""
+    for begin in range(0, len(numbers), TOGETHER):
+        some = list(numbers[begin : begin + TOGETHER])
+        filled = np.array([*some, *[some[-1]] * (min(TOGETHER, len(likelihoods)) - len(some))])
+        rows = np.minimum(np.arange(begin, begin + len(filled)), begin + len(some) - 1)
+        normal = Normal(*map(np.asarray, equations_of_many(stack, filled, array(values[rows]))))
+        for k, n in enumerate(some):
+            likelihood = likelihoods[n]
+            terms = DataTerms(
+                float(normal.chi2[k]), normal.gradient[k].copy(), normal.matrix[k], likelihood.census
+            )
+            yield likelihood.expanded(values[begin + k], terms, 1.0, OpticsUsed(None))
+
+
+# ------------------------------------------------------------------------------------------- many sets as one argument
+
+
+class Stack(eqx.Module):
+    """Trees of one structure as one argument of a program.
+
+    Leaves that are the same in all trees are in `first` alone; those that differ are stacked in `varying`, with the
+    trees along the leading axis, and `places` are their positions among the leaves.
+    """
+
+    first: Any
+    varying: tuple[Array, ...]
+    places: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, trees: Sequence[Any]) -> Stack:
+        """Stack trees. Raises `DataError` with the position of the first one that has another structure."""
+        leaves, structure = jax.tree.flatten(trees[0])
+        kinds = [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
+        columns = [[np.asarray(leaf)] for leaf in leaves]
+        for n, tree in enumerate(trees[1:], start=1):
+            its_leaves, its_structure = jax.tree.flatten(tree)
+            if its_structure != structure or kinds != [
+                (np.shape(leaf), np.asarray(leaf).dtype) for leaf in its_leaves
+            ]:
+                what = f"set {n} has another layout than set 0"
+                advice = (
+                    "sets that are fitted together need as many exposures, field points and cameras, and the same "
+                    "filters and settings of the moving elements: fit the others by themselves with walop.refit"
+                )
+                raise fail(what, advice=advice)
+            for column, leaf in zip(columns, its_leaves, strict=True):
+                column.append(np.asarray(leaf))
+        differ = [
+            i
+            for i, column in enumerate(columns)
+            if any(
+                not np.array_equal(column[0], leaf, equal_nan=leaf.dtype.kind == "f") for leaf in column[1:]
+            )
+        ]
+        return cls(trees[0], tuple(array(np.stack(columns[i])) for i in differ), tuple(differ))
+
+    def at(self, number: Int[Array, ""]) -> Any:
+        """The tree of that number; may be traced."""
+        leaves, structure = jax.tree.flatten(self.first)
+        for place, column in zip(self.places, self.varying, strict=True):
+            leaves[place] = column[number]
+        return structure.unflatten(leaves)
+
+
+def _inputs(likelihood: Likelihood) -> tuple[Instrument, Plan, PointData]:
+    """What the residuals of a set depend on beside the parameters; all of its points as one batch."""
+    layout, reader = likelihood.layout, likelihood.points.reader
+    (data,) = reader.batches(0, layout.points, layout.points)
+    return likelihood.model.template, layout.plan, data
+
+
+def _likelihoods(calsets: Sequence[CalibrationSet], model: Model) -> list[Likelihood]:
+    """The likelihood of each set; a set with the exposures and sources of the first one shares its layout."""
+    first = Likelihood.of(calsets[0], model)
+    if first.layout.interpolated:
+        what = f"set 0 has {first.layout.points} field points"
+        raise fail(what, advice="whole frames are fitted one by one: walop.refit")
+    needs_no_counts = first.plan.exposures.median_counts is None  # else every set has a plan of its own
+    likelihoods = [first]
+    for calset in calsets[1:]:
+        if needs_no_counts and all(_same(getattr(calset, what), getattr(calsets[0], what)) for what in FACTS):
+            reader = PointReader(calset, first.plan, model.template, first.layout.mirrored)
+            points = MeasuredPoints(reader, first.layout)
+            likelihoods.append(Likelihood(first.layout, points, first.runner, model))
+        else:
+            likelihoods.append(Likelihood.of(calset, model))
+    return likelihoods
+
+
+def _same(one: Any, other: Any) -> bool:
+    """True if records, mappings or arrays hold the same numbers and names."""
+    if dataclasses.is_dataclass(one):
+        names = [field.name for field in dataclasses.fields(one)]
+        return type(one) is type(other) and all(_same(getattr(one, n), getattr(other, n)) for n in names)
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(_same(value, other[key]) for key, value in one.items())
+    a, b = np.asarray(one), np.asarray(other)
+    return bool(np.array_equal(a, b, equal_nan=a.dtype.kind == b.dtype.kind == "f"))
+
+
+# --------------------------------------------------------------------------------------------------------- the program
+
+
+def _equations_of_many(stack: Stack, numbers: Int[Array, " s"], values: Float[Array, "s n"]) -> Normal:
+    """χ², Jᵀr and JᵀJ of some of the sets, each at its own values of all parameters."""
+
+    def one(given: tuple[Array, Array]) -> Normal:
+        number, at = given
+        template, plan, data = stack.at(number)
+        residual, slope = engine.residuals_and_slopes(with_values(template)(at), plan, data)
+        r, jacobian = residual.reshape(-1), slope.reshape(-1, at.size)
+        return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
+
+    # One after the other on a CPU, whose cache holds the Jacobian of one set; side by side where there are many cores.
+    side_by_side = None if jax.default_backend() == "cpu" else TOGETHER
+    return jax.lax.map(one, (jnp.asarray(numbers), values), batch_size=side_by_side)
+
+
+equations_of_many = compiled(_equations_of_many, kept_as="equations_of_many")
