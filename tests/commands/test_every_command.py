@@ -87,7 +87,6 @@ LINES = {
     "trace": [Line("trace RUN --x 0.1 --y 0.2 --q 0.01")],
     "standards": [Line("standards --near 308,41"), Line("standards --up 61041.9")],
     "cite": [Line("cite RUN"), Line("cite RUN --bibtex")],
-    "conformance": [Line("conformance --make PACK")],
     "docs": [Line("docs files"), Line("docs")],
 }
 """What is typed for each command; a new one needs its line here."""

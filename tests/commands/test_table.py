@@ -166,7 +166,6 @@ CASES = {
         lambda g: ("--near", "308,41"), lambda g, **k: walop.standards(near=(308.0, 41.0), **k)
     ),
     "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
-    "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
 ELSEWHERE = {"exposures", "demo", "clip", "sample", "plan", "stack"}
@@ -187,7 +186,6 @@ class Given(NamedTuple):
     points: Path
     stars: Path
     exports: Path
-    pack: Path
     cameras: tuple[Path, ...]
 
 
@@ -206,7 +204,6 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
         tmp_path / "points.csv",
         tmp_path / "stars.fits",
         exports,
-        tmp_path / "pack",
         tuple(four(some_stars(), tmp_path)),
     )
 
@@ -223,13 +220,12 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     assert done.exit_code == (3 if name == "watch" else 0), done.output  # two stars, one camera too bright
     document = json.loads(done.stdout)
     output = {"output": caller / case.output} if case.output else {}
-    again = {"overwrite": True} if name == "conformance" else {}
-    value = case.python(given, progress=told.append, **output, **again)
+    value = case.python(given, progress=told.append, **output)
     assert value is not None
     assert_same_files(command, caller)
     if case.output.startswith("RUN"):
         assert_same_files(command / case.output, caller / case.output)
-    if name not in ("instrument", "docs", "trace", "cite", "standards", "model", "conformance"):
+    if name not in ("instrument", "docs", "trace", "cite", "standards", "model"):
         assert told
     if isinstance(document, dict) and "seed" in document:
         assert isinstance(document["seed"], int)
@@ -254,10 +250,9 @@ def test_quiet_is_quiet_and_without_output_nothing_is_written(
     case, before = CASES[name], sorted(tmp_path.iterdir())
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    if name != "conformance":
-        assert case.python(given) is not None
-        assert not any((tmp_path / "here").iterdir())
-        assert sorted(entry for entry in tmp_path.iterdir() if entry.name != "here") == before
+    assert case.python(given) is not None
+    assert not any((tmp_path / "here").iterdir())
+    assert sorted(entry for entry in tmp_path.iterdir() if entry.name != "here") == before
     words = ("-o", case.output) if case.output else ()
     quiet = call(name, *case.words(given), *words, "--quiet")
     assert (quiet.exit_code, quiet.stdout) == (0, "")

@@ -22,7 +22,7 @@ GROUPS: Mapping[str, Sequence[str]] = {
     "Many nights": ("epoch", "watch", "affected", "quality", "stack"),
     "Plan and rehearse": ("plan", "simulate"),
     "Describe an instrument": ("model", "instrument", "trace", "standards", "import-zemax"),
-    "Credits and conformance": ("cite", "conformance"),
+    "Credits": ("cite",),
 }
 """The commands in the groups of the help. `import-zemax` is the function `import_zemax` of `import_zemax.py`."""
 
