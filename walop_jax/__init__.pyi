@@ -14,7 +14,6 @@ from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.exposures import exposures as exposures
 from walop_jax.commands.gather import gather as gather
-from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
 
 # Methods of results in rooms below: not public by themselves.

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from camera_files import four, some_stars
-from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.command import COMMON
 from walop_jax.data.settings import DEFAULT_FILTER
-from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
 from walop_jax.fit import outliers
 from walop_jax.posterior.result import Options
 from walop_jax.science.polarisation import ESTIMATORS
@@ -63,8 +61,6 @@ def test_defaults_are_those_of_what_is_called():
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
     assert default("clip", "sigma") == outliers.BEYOND
     assert default("apply", "debias") == ESTIMATORS[0]
-    assert default("import-zemax", "cameras") == ",".join(map(str, CAMERA_CONFIGURATIONS))
-    assert default("import-zemax", "error") == RELATIVE_ERROR
     for key in ("sampler", "walkers", "interval", "maximum_steps", "moves", "inflate"):
         assert default("sample", key) == getattr(Options(), key)
 
@@ -158,9 +154,6 @@ CASES = {
         "m.toml",
     ),
     "instrument": Case(lambda g: ("WALOP-SOUTH",), lambda g, **k: walop.instrument("WALOP-SOUTH", **k)),
-    "import-zemax": Case(
-        lambda g: (g.exports,), lambda g, **k: walop.import_zemax(g.exports, **k), "set.fits"
-    ),
     "trace": Case(lambda g: (g.run, "--x", 0.1), lambda g, **k: walop.trace(g.run, x=0.1, **k)),
     "standards": Case(
         lambda g: ("--near", "308,41"), lambda g, **k: walop.standards(near=(308.0, 41.0), **k)
@@ -185,7 +178,6 @@ class Given(NamedTuple):
     run: Path
     points: Path
     stars: Path
-    exports: Path
     cameras: tuple[Path, ...]
 
 
@@ -195,7 +187,6 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
     n = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
     stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": np.sqrt(n)})
     stars.write(tmp_path / "stars.fits")
-    exports = write_folder(tmp_path / "exports")
     (tmp_path / "plan.toml").write_text(PLAN)
     return Given(
         tmp_path / "plan.toml",
@@ -203,7 +194,6 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
         fitted.run,
         tmp_path / "points.csv",
         tmp_path / "stars.fits",
-        exports,
         tuple(four(some_stars(), tmp_path)),
     )
 

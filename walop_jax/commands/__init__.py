@@ -21,10 +21,10 @@ GROUPS: Mapping[str, Sequence[str]] = {
     "Check a calibration": ("certify", "limits", "compare"),
     "Many nights": ("epoch", "watch", "affected", "quality", "stack"),
     "Plan and rehearse": ("plan", "simulate"),
-    "Describe an instrument": ("model", "instrument", "trace", "standards", "import-zemax"),
+    "Describe an instrument": ("model", "instrument", "trace", "standards"),
     "Credits": ("cite",),
 }
-"""The commands in the groups of the help. `import-zemax` is the function `import_zemax` of `import_zemax.py`."""
+"""The commands in the groups of the help."""
 
 COMMANDS = tuple(itertools.chain(*GROUPS.values()))  # every command in the order of the help
 
