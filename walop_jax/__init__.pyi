@@ -6,7 +6,6 @@ from walop_jax.commands.affected import affected as affected
 from walop_jax.commands.apply import apply as apply
 from walop_jax.commands.certify import certify as certify
 from walop_jax.commands.cite import cite as cite
-from walop_jax.commands.clip import clip as clip
 from walop_jax.commands.compare import compare as compare
 from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose

@@ -50,9 +50,9 @@ LINES = {
     ],
     "refit": [
         Line("refit set.fits -o FIT", "summary", "seconds"),
+        Line("refit set.fits --clip 5 -o FIT", "summary", "seconds"),
         Line("refit frames.fits --compress small.fits -o FIT", "summary", "minutes"),
     ],
-    "clip": [Line("clip set.fits -o clipped.fits", takes="seconds")],
     "diagnose": [Line("diagnose set.fits -o FOUND", "diagnosis", "seconds")],
     "limits": [
         Line("limits set.fits -o LIMITS", "limits", "seconds"),

@@ -17,7 +17,6 @@ import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.command import COMMON
 from walop_jax.data.settings import DEFAULT_FILTER
-from walop_jax.fit import outliers
 from walop_jax.posterior.result import Options
 from walop_jax.science.polarisation import ESTIMATORS
 
@@ -59,7 +58,6 @@ def test_defaults_are_those_of_what_is_called():
 
     assert default("diagnose", "minutes") is None
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
-    assert default("clip", "sigma") == outliers.BEYOND
     assert default("apply", "debias") == ESTIMATORS[0]
     for key in ("sampler", "walkers", "interval", "maximum_steps", "moves", "inflate"):
         assert default("sample", key) == getattr(Options(), key)
@@ -161,8 +159,8 @@ CASES = {
     "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
-ELSEWHERE = {"exposures", "demo", "clip", "sample", "plan", "stack"}
-# data/test_header_words; fit/test_outliers; test_sample; tests/plans; tests/nights
+ELSEWHERE = {"exposures", "demo", "sample", "plan", "stack"}
+# data/test_header_words; test_sample; tests/plans; tests/nights
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 GROUPS: Mapping[str, Sequence[str]] = {
     "Begin": ("demo", "docs"),
-    "Calibrate": ("exposures", "inspect", "refit", "clip", "diagnose", "sample", "report", "plot"),
+    "Calibrate": ("exposures", "inspect", "refit", "diagnose", "sample", "report", "plot"),
     "Correct stars": ("matrix", "gather", "apply"),
     "Check a calibration": ("certify", "limits", "compare"),
     "Many nights": ("epoch", "watch", "affected", "quality", "stack"),
