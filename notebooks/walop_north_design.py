@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+from zemax import import_transmissions
 
 import walop_jax as walop
 from walop_jax import CalibrationSet, FitResult, Settings
@@ -43,7 +44,7 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
     """The transmissions of the optical design as a calibration set.
 
     Where NORTH_DESIGN names a set it is read. Else the text exports are fetched from their public repository (git) and
-    imported, once.
+    imported by `zemax.py`, once.
     """
     named = os.environ.get("NORTH_DESIGN")
     if named:
@@ -57,7 +58,7 @@ def design_set(folder: str | Path = "walop_north_design") -> CalibrationSet:
         exports = next(
             path.parent for path in sorted(source.rglob("Config_1")) if path.parent.name != "Unpol"
         )
-        walop.import_zemax(exports, output=made, instrument="WALOP-NORTH")
+        walop.write_calibration_set(made, import_transmissions(exports)[0])
     return walop.read(made)
 
 

@@ -391,6 +391,25 @@ def test_tables_of_effects_are_those_of_the_catalogue():
     assert page[start:stop].strip() == catalogue_tables().strip()
 
 
+def elements_table() -> str:
+    """The table of all kinds of elements in docs: adding-an-instrument, as Markdown, from their classes."""
+    from walop_jax.model.elements.registry import ELEMENTS
+    from walop_jax.model.elements.wave_plate import Layer
+    from walop_jax.model.parameters import numbers_of
+
+    lines = ["| kind | number | unit | meaning |", "| --- | --- | --- | --- |"]
+    for name, kind in {**{one.kind: one for one in ELEMENTS}, "layers": Layer}.items():
+        about_kind = inspect.cleandoc(kind.__doc__ or "").splitlines()[0].rstrip(".")
+        lines.append(f"| `{name}` | | | {about_kind} |")
+        lines += [f"| | `{name}` | {d.unit} | {d.about} |" for name, d in numbers_of(kind).items()]
+    return "\n".join(lines).replace("|  |", "| |")
+
+
+def test_table_of_elements_is_that_of_their_classes():
+    """Generated: what the page should say is what the assertion shows."""
+    assert elements_table() in section("adding-an-instrument", "Kinds of elements")
+
+
 def test_kinds_and_factors_of_descriptions_are_in_their_tables():
     from walop_jax.model.effects.change import KINDS
     from walop_jax.model.effects.factors import FORMS, PLAIN

@@ -6,16 +6,13 @@ from walop_jax.commands.affected import affected as affected
 from walop_jax.commands.apply import apply as apply
 from walop_jax.commands.certify import certify as certify
 from walop_jax.commands.cite import cite as cite
-from walop_jax.commands.clip import clip as clip
 from walop_jax.commands.compare import compare as compare
-from walop_jax.commands.conformance import conformance as conformance
 from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
 from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.exposures import exposures as exposures
 from walop_jax.commands.gather import gather as gather
-from walop_jax.commands.import_zemax import import_zemax as import_zemax
 from walop_jax.commands.inputs import read as read
 
 # Methods of results in rooms below: not public by themselves.

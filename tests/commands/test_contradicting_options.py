@@ -15,7 +15,6 @@ from small_run import small_fit
 
 import walop_jax as walop
 from walop_jax.commands.command import Command, Outcome, given, typed
-from walop_jax.fit.outliers import Clipped
 from walop_jax.posterior.run import Run
 
 PLAN = "grid = 2\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
@@ -206,20 +205,6 @@ def test_suggested_paths_with_blanks_can_be_typed(call, calset_file, here: Path)
     done = call("model", calset_file, "-o", "my model.toml")
     (line,) = re.findall("Next: (.*)", done.stderr)
     assert shlex.split(line)[:6] == ["walop-jax", "refit", str(calset_file), "--model", "my model.toml", "-o"]
-
-
-@pytest.mark.parametrize("rows", [1, 1000])
-def test_after_clip_a_fit_is_suggested_or_a_diagnosis_of_the_set_as_it_was(
-    call, calset_file, here: Path, monkeypatch, rows: int
-):
-    fit = small_fit()
-    made = Clipped(fit.calset, fit, rows, 1000)
-    monkeypatch.setattr("walop_jax.fit.outliers.clipped", lambda *arguments: made)
-    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda fit, *arguments, **options: fit)
-    done = call("clip", calset_file, "-o", "clipped.fits", "--instrument", "WALOP-SOUTH")
-    (line,) = re.findall("Next: (.*)", done.stderr)
-    asked = ("refit", "clipped.fits") if rows == 1 else ("diagnose", str(calset_file))
-    assert shlex.split(line) == ["walop-jax", *asked, "--instrument", "WALOP-SOUTH", "-o", "RUN"]
 
 
 def test_a_calibration_that_is_not_fit_for_use_is_not_suggested_for_use(call, here: Path):

@@ -21,7 +21,6 @@ from command import Call
 from frame_run import frame_run, raster
 from frames_file import write_frames
 from own_instrument import OWN
-from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
@@ -51,9 +50,9 @@ LINES = {
     ],
     "refit": [
         Line("refit set.fits -o FIT", "summary", "seconds"),
+        Line("refit set.fits --clip 5 -o FIT", "summary", "seconds"),
         Line("refit frames.fits --compress small.fits -o FIT", "summary", "minutes"),
     ],
-    "clip": [Line("clip set.fits -o clipped.fits", takes="seconds")],
     "diagnose": [Line("diagnose set.fits -o FOUND", "diagnosis", "seconds")],
     "limits": [
         Line("limits set.fits -o LIMITS", "limits", "seconds"),
@@ -83,11 +82,9 @@ LINES = {
     "stack": [Line("stack RUN -o SURVEY", "survey", "seconds")],
     "model": [Line("model set.fits --effect clp_zero -o model.toml", takes="seconds")],
     "instrument": [Line("instrument WALOP-SOUTH", takes="seconds")],
-    "import-zemax": [Line("import-zemax exports -o design.fits", takes="minutes")],
     "trace": [Line("trace RUN --x 0.1 --y 0.2 --q 0.01")],
     "standards": [Line("standards --near 308,41"), Line("standards --up 61041.9")],
     "cite": [Line("cite RUN"), Line("cite RUN --bibtex")],
-    "conformance": [Line("conformance --make PACK")],
     "docs": [Line("docs files"), Line("docs")],
 }
 """What is typed for each command; a new one needs its line here."""
@@ -140,7 +137,7 @@ def test_every_command_of_the_readme_is_among_them():
 
 @pytest.fixture(scope="module")
 def home(calset_file: Path, run: Path, tmp_path_factory) -> Path:
-    """A folder with what users have: a set and its fit, stars, points, plans, exports of a design program."""
+    """A folder with what users have: a set and its fit, stars, points, plans."""
     folder = tmp_path_factory.mktemp("home")
     shutil.copyfile(calset_file, folder / "set.fits")
     shutil.copytree(run, folder / "RUN")
@@ -152,7 +149,6 @@ def home(calset_file: Path, run: Path, tmp_path_factory) -> Path:
     columns = {"KIND": "TYPE", "CLP_ANGLE": "ANGLE", "EXPTIME": "SECONDS"}
     words = "".join(f'[{name}]\nword = "{word}"\n' for name, word in columns.items())
     (folder / "words.toml").write_text(f"{words}[CLP_IN]\nvalue = true\n")
-    write_folder(folder / "exports")
     four(some_stars(), folder)
     _stars(folder / "RUN").write(folder / "stars.fits")
     return folder

@@ -139,12 +139,14 @@ def test_streams_that_are_closed_are_no_error(tmp_path: Path, closed: tuple[int,
     """As daemons start programs (`>&-`): the work is done, what would be printed is dropped and ends up in no file."""
     close = " ".join(("<&-", ">&-", "2>&-")[number] for number in closed)
     shown = subprocess.run(
-        ["bash", "-c", f'"$@" {close}', "bash", sys.executable, "-m", "walop_jax", "conformance", "--make", "pack"],
+        ["bash", "-c", f'"$@" {close}', "bash", sys.executable, "-m", "walop_jax", "model", "-o", "model.toml"],
         cwd=tmp_path, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert (shown.returncode, shown.stderr) == (0, "")
-    assert sorted(path.name for path in (tmp_path / "pack").iterdir())[-1] == "results.csv"
-    assert "questions" not in "".join(path.read_text() for path in (tmp_path / "pack").glob("*.csv"))
+    assert [path.name for path in tmp_path.iterdir()] == ["model.toml"]
+    written = (tmp_path / "model.toml").read_text(encoding="utf-8")
+    assert "[parameters" in written
+    assert "of them free" not in written  # what the program prints
 
 
 def test_a_back_end_of_a_notebook_is_not_needed(tmp_path: Path):

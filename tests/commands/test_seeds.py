@@ -22,7 +22,6 @@ CALLS = {
     "limits": lambda g, **k: walop.limits(g.calset, **k),
     "compare": lambda g, **k: walop.compare(g.calset, **k),
     "epoch": lambda g, **k: walop.epoch(g.run, g.calset, **k),
-    "clip": lambda g, **k: walop.clip(g.calset, **k),
 }
 
 

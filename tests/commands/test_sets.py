@@ -1,4 +1,4 @@
-"""`simulate`, `import_zemax`, `inspect`, `model` from Python: calibration sets and models, made and looked at."""
+"""`simulate`, `inspect`, `model` from Python: calibration sets and models, made and looked at."""
 
 from __future__ import annotations
 

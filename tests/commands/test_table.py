@@ -12,14 +12,11 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from camera_files import four, some_stars
-from zemax_exports import write_folder
 
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.command import COMMON
 from walop_jax.data.settings import DEFAULT_FILTER
-from walop_jax.data.zemax import CAMERA_CONFIGURATIONS, RELATIVE_ERROR
-from walop_jax.fit import outliers
 from walop_jax.posterior.result import Options
 from walop_jax.science.polarisation import ESTIMATORS
 
@@ -61,10 +58,7 @@ def test_defaults_are_those_of_what_is_called():
 
     assert default("diagnose", "minutes") is None
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
-    assert default("clip", "sigma") == outliers.BEYOND
     assert default("apply", "debias") == ESTIMATORS[0]
-    assert default("import-zemax", "cameras") == ",".join(map(str, CAMERA_CONFIGURATIONS))
-    assert default("import-zemax", "error") == RELATIVE_ERROR
     for key in ("sampler", "walkers", "interval", "maximum_steps", "moves", "inflate"):
         assert default("sample", key) == getattr(Options(), key)
 
@@ -158,19 +152,15 @@ CASES = {
         "m.toml",
     ),
     "instrument": Case(lambda g: ("WALOP-SOUTH",), lambda g, **k: walop.instrument("WALOP-SOUTH", **k)),
-    "import-zemax": Case(
-        lambda g: (g.exports,), lambda g, **k: walop.import_zemax(g.exports, **k), "set.fits"
-    ),
     "trace": Case(lambda g: (g.run, "--x", 0.1), lambda g, **k: walop.trace(g.run, x=0.1, **k)),
     "standards": Case(
         lambda g: ("--near", "308,41"), lambda g, **k: walop.standards(near=(308.0, 41.0), **k)
     ),
     "cite": Case(lambda g: (g.run,), lambda g, **k: walop.cite(g.run, **k)),
-    "conformance": Case(lambda g: ("--make", g.pack), lambda g, **k: walop.conformance(make=g.pack, **k)),
     "docs": Case(lambda g: ("files",), lambda g, **k: walop.docs("files", **k)),
 }
-ELSEWHERE = {"exposures", "demo", "clip", "sample", "plan", "stack"}
-# data/test_header_words; fit/test_outliers; test_sample; tests/plans; tests/nights
+ELSEWHERE = {"exposures", "demo", "sample", "plan", "stack"}
+# data/test_header_words; test_sample; tests/plans; tests/nights
 CHEAP = [name for name, case in CASES.items() if not case.long]
 WRITING = [name for name in CHEAP if CASES[name].output]
 TABLE = [pytest.param(name, marks=[pytest.mark.long] if CASES[name].long else []) for name in CASES]
@@ -186,8 +176,6 @@ class Given(NamedTuple):
     run: Path
     points: Path
     stars: Path
-    exports: Path
-    pack: Path
     cameras: tuple[Path, ...]
 
 
@@ -197,7 +185,6 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
     n = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
     stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": np.sqrt(n)})
     stars.write(tmp_path / "stars.fits")
-    exports = write_folder(tmp_path / "exports")
     (tmp_path / "plan.toml").write_text(PLAN)
     return Given(
         tmp_path / "plan.toml",
@@ -205,8 +192,6 @@ def given(fitted: FittedSet, tmp_path: Path) -> Given:
         fitted.run,
         tmp_path / "points.csv",
         tmp_path / "stars.fits",
-        exports,
-        tmp_path / "pack",
         tuple(four(some_stars(), tmp_path)),
     )
 
@@ -223,13 +208,12 @@ def test_files_and_document_are_those_of_the_program(name: str, call, given: Giv
     assert done.exit_code == (3 if name == "watch" else 0), done.output  # two stars, one camera too bright
     document = json.loads(done.stdout)
     output = {"output": caller / case.output} if case.output else {}
-    again = {"overwrite": True} if name == "conformance" else {}
-    value = case.python(given, progress=told.append, **output, **again)
+    value = case.python(given, progress=told.append, **output)
     assert value is not None
     assert_same_files(command, caller)
     if case.output.startswith("RUN"):
         assert_same_files(command / case.output, caller / case.output)
-    if name not in ("instrument", "docs", "trace", "cite", "standards", "model", "conformance"):
+    if name not in ("instrument", "docs", "trace", "cite", "standards", "model"):
         assert told
     if isinstance(document, dict) and "seed" in document:
         assert isinstance(document["seed"], int)
@@ -254,10 +238,9 @@ def test_quiet_is_quiet_and_without_output_nothing_is_written(
     case, before = CASES[name], sorted(tmp_path.iterdir())
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    if name != "conformance":
-        assert case.python(given) is not None
-        assert not any((tmp_path / "here").iterdir())
-        assert sorted(entry for entry in tmp_path.iterdir() if entry.name != "here") == before
+    assert case.python(given) is not None
+    assert not any((tmp_path / "here").iterdir())
+    assert sorted(entry for entry in tmp_path.iterdir() if entry.name != "here") == before
     words = ("-o", case.output) if case.output else ()
     quiet = call(name, *case.words(given), *words, "--quiet")
     assert (quiet.exit_code, quiet.stdout) == (0, "")

@@ -67,5 +67,6 @@ def summary(
             "rms_beyond_noise": residuals.excess(),
             "significance": residuals.significance(),
         },
+        "clipped": None if result.clipped is None else result.clipped.document(),
         "remarks": list(result.calset.remarks),
     }

@@ -16,15 +16,15 @@ from pathlib import Path
 
 GROUPS: Mapping[str, Sequence[str]] = {
     "Begin": ("demo", "docs"),
-    "Calibrate": ("exposures", "inspect", "refit", "clip", "diagnose", "sample", "report", "plot"),
+    "Calibrate": ("exposures", "inspect", "refit", "diagnose", "sample", "report", "plot"),
     "Correct stars": ("matrix", "gather", "apply"),
     "Check a calibration": ("certify", "limits", "compare"),
     "Many nights": ("epoch", "watch", "affected", "quality", "stack"),
     "Plan and rehearse": ("plan", "simulate"),
-    "Describe an instrument": ("model", "instrument", "trace", "standards", "import-zemax"),
-    "Credits and conformance": ("cite", "conformance"),
+    "Describe an instrument": ("model", "instrument", "trace", "standards"),
+    "Credits": ("cite",),
 }
-"""The commands in the groups of the help. `import-zemax` is the function `import_zemax` of `import_zemax.py`."""
+"""The commands in the groups of the help."""
 
 COMMANDS = tuple(itertools.chain(*GROUPS.values()))  # every command in the order of the help
 

@@ -10,7 +10,7 @@ from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, after
 from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.folder import output_folder
-from walop_jax.io.names import DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
+from walop_jax.io.names import CLIPPED, DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
 from walop_jax.io.progress import repeated
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import json_text
@@ -98,6 +98,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
             MODEL: render(after.model),
         },
         saved_as=DIAGNOSIS,
+        drop=(CLIPPED,),
         warnings=after.warnings,
         trusted=usable,
         next=after_fit(output, usable=usable),

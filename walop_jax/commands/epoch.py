@@ -9,7 +9,7 @@ from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import Sets, set_of
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
-from walop_jax.io.names import EPOCH, PRODUCT
+from walop_jax.io.names import CLIPPED, EPOCH, PRODUCT
 
 if TYPE_CHECKING:
     from walop_jax.science.epoch import Epoch
@@ -76,6 +76,7 @@ def epoch(
         display=shown,
         files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result))},
         saved_as=EPOCH,
+        drop=(CLIPPED,),
         warnings=[f"the new fit: {w}" if w in result.warnings else w for w in comparison.warnings],
         trusted=comparison.holds,
         next=(typed("report", output),),

@@ -15,7 +15,7 @@ from walop_jax.commands.command import PathLike, UsageError, several
 from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, design_of, path_of
 from walop_jax.io.errors import DataError, errors_naming, fail
 from walop_jax.io.folder import output_folder
-from walop_jax.io.names import DOCUMENTS, FAILED, PRODUCT, SUMMARY
+from walop_jax.io.names import CLIPPED, DOCUMENTS, FAILED, PRODUCT, SUMMARY
 from walop_jax.io.text import json_text, read_text
 
 if TYPE_CHECKING:
@@ -141,11 +141,19 @@ def save(
         raise fail("holds no calibration", file=getattr(result, "folder", ""), advice="give a fit")
     product = Calibration.from_fit(held) if isinstance(held, FitResult) else held
     names = (PRODUCT, SUMMARY) if isinstance(held, FitResult) else (PRODUCT,)
-    with output_folder(folder, names, overwrite=overwrite) as out, out.filled() as temporary:
+    rows = held.clipped if isinstance(held, FitResult) else None
+    names += (CLIPPED,) if rows is not None else ()
+    drop = () if rows is not None else (CLIPPED,)
+    with (
+        output_folder(folder, names, overwrite=overwrite) as out,
+        out.filled(names, drop) as temporary,
+    ):
         write_calibration(temporary / PRODUCT, product)
         if isinstance(held, FitResult):
             content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
             (temporary / SUMMARY).write_text(json_text(content), encoding="utf-8")
+            if rows is not None:
+                rows.write(temporary / CLIPPED, held.calset, held.model.template.cameras.names)
 
 
 def goal_of(percent: float | None) -> float | None:

@@ -18,7 +18,7 @@ from walop_jax.commands.command import (
 from walop_jax.commands.inputs import ModelLike, Sets, goal_of, paths_of, set_and_model
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.atomic import check_output
-from walop_jax.io.names import FAILED, PRODUCT, SUMMARY
+from walop_jax.io.names import CLIPPED, FAILED, PRODUCT, SUMMARY
 from walop_jax.io.progress import Stage, repeated
 from walop_jax.io.text import json_text
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
-@command(stages=STAGES, writes=(PRODUCT, SUMMARY), random=True)
+@command(stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True)
 def refit(
     job: Job,
     data: Sets,
@@ -40,6 +40,7 @@ def refit(
     memory: float | None = 2.0,
     compress: PathLike | None = None,
     goal: float | None = None,
+    clip: float | None = None,
 ) -> Outcome[FitResult]:
     """Fit all field points of calibration sets jointly: RUN/calibration.fits and RUN/summary.json.
 
@@ -53,13 +54,19 @@ def refit(
     The first lines give the error of p of a star, whether it is good enough for --goal, and what to do if
     not; the calibration may make half of the goal.
 
+    --clip leaves single intensities out that lie so many standard errors from the fit of all others (cosmic rays, stars
+    in a patch of sky; 5 is usual), and lists them in RUN/clipped.ecsv. The set is fitted anew until nothing lies off
+    any more. Where more than 5 % of the rows do, the model lacks something: the command stops, and diagnose looks for
+    it.
+
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
     the residuals of the smooth model. --compress makes of them a set of some hundred field points, a megabyte: refit,
     diagnose, limits, epoch and sample read it like any other set and answer in seconds as from all pixels, near the
     values that were fitted, with a warning when these have moved too far. Structure smaller than a twentieth of the
     field is not in it.
 
-    In Python: the fit. Raises `DataError` for data that cannot be trusted, ValueError for a model that does not fit.
+    In Python: the fit, whose `clipped` are the rows left out and whose `calset` has them flagged. Raises `DataError`
+    for data that cannot be trusted, ValueError for a model that does not fit.
 
     >>> result = walop.refit(calset)  # doctest: +SKIP
     >>> result["pupil.magnification"]
@@ -73,7 +80,9 @@ def refit(
     from walop_jax.data.write import write_calibration_set
     from walop_jax.diagnosis.trust import examined, stand_in
     from walop_jax.fit.misfit import describe
+    from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
+    from walop_jax.fit.refit import with_honest_errors
     from walop_jax.science.field_accuracy import answered
 
     wanted = goal_of(goal) or GOAL
@@ -82,7 +91,11 @@ def refit(
     job.begin("reading")
     calset, chosen = set_and_model(data, model, instrument, effects, output=output)
     with repeated(job.progress) as say:
-        fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
+        if clip is None:
+            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
+        else:
+            say(Stage("fitting without outliers", "fitting"))
+            fitted = with_honest_errors(clipped(calset, chosen, clip))
         say(Stage("looking for patterns in the residuals", "examining"))
         result = answered(examined(fitted, job.seed), goal=wanted)
     if compress is not None and result.converged:
@@ -91,6 +104,7 @@ def refit(
     residuals = residual_map(result) if mapped else None
     misfit = describe(result) if output is not None and not result.explains_data else None
     shown = dataclasses.replace(result.display(), notes=result.notes)
+    rows, cameras = result.clipped, result.model.template.cameras.names
     brief = dataclasses.replace(shown, rows=(), notes=()).text()
     judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
     options = {"instrument": instrument, "effects": effects, "elements": job.elements}
@@ -101,7 +115,10 @@ def refit(
         display=shown,
         text=None if result.trusted else f"{brief}\n{judged}",
         below=judged,
-        files={PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals))},
+        files={
+            PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals)),
+            CLIPPED: None if rows is None else lambda path: rows.write(path, calset, cameras),
+        },
         saved_as=SUMMARY,
         drop=(FAILED,),
         next=next_steps(result.trusted, output, data, **options),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, UsageError, after_fit, command, several
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of
-from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
+from walop_jax.io.names import CLIPPED, NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -75,7 +75,7 @@ def stack(
         survey,
         files=writers(survey),
         saved_as=SURVEY,
-        drop=(PARTIAL,),
+        drop=(PARTIAL, CLIPPED),
         warnings=survey.verdict.warnings,
         trusted=survey.trusted,
         next=after_fit(output, usable=survey.trusted),

@@ -34,7 +34,7 @@ _SINGLE = re.compile(r"MONO-(\d{3,6}(?:\.\d+)?)")
 
 
 def single_wavelength(name: str) -> float | None:
-    """Wavelength (µm) of light called MONO-<Ångström>, as `import-zemax` names it; None: another name."""
+    """Wavelength (µm) of light called MONO-<Ångström>; None: another name."""
     match = _SINGLE.fullmatch(name)
     return None if match is None else 1e-4 * float(match[1])
 

@@ -56,7 +56,7 @@ class Misfit:
     def advice(self) -> tuple[str, ...]:
         """The remedy, where single rows spoil the fit."""
         share = f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off"
-        advice = "if these are cosmic rays or stars, walop-jax clip flags them"
+        advice = f"if these are cosmic rays or stars, walop-jax refit --clip {BEYOND:g} leaves them out"
         return (f"{share}: {advice}",) if 0.0 < self.outliers <= MOST else ()
 
     def reasons(self, warnings: Sequence[str], folder: PathLike | None) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data.clipped import Clipped
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum
@@ -57,7 +58,8 @@ class FitResult(Fitted):
     are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
     are known with it (`science.field_accuracy.answered`), which is shown first. `averaged` makes of its calibration the
     product of a diagnosis (`diagnosis.class_product`), `mean_of_models` if that is a mean over models that its data
-    cannot tell apart.
+    cannot tell apart. `clipped` are the rows that it left out as outliers, None if it was not asked to
+    (`outliers.clipped`).
 
     >>> result.value("pupil.magnification")[0].__round__(2)
     15.67
@@ -76,6 +78,7 @@ class FitResult(Fitted):
     answer: Callable[[], Any] | None = None
     averaged: Callable[[Any], Any] | None = None
     mean_of_models: bool = False
+    clipped: Clipped | None = None
 
     @classmethod
     def of(cls, likelihood: Likelihood, *, noise_scale: float | None = None) -> FitResult:
@@ -228,6 +231,8 @@ class FitResult(Fitted):
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",
             "errors from": self.errors_from,
         }
+        if self.clipped is not None:
+            facts["outliers"] = str(self.clipped)
         return self.shown(f"Fit of {self.model.name}: {verdict}", facts, (*self.notes, *self.warnings))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 IN_MEMORY = "in memory"  # in place of the path of a file
 PRODUCT, MODEL = "calibration.fits", "model.toml"
-SUMMARY, FAILED = "summary.json", "summary.failed.json"
+SUMMARY, FAILED, CLIPPED = "summary.json", "summary.failed.json", "clipped.ecsv"
 DIAGNOSIS, FIGURE_DATA = "diagnosis.json", "diagnosis.fits"
 POSTERIOR, CORNER, SAMPLE = "posterior.nc", "posterior_corner.png", "sample.json"
 COMPARISON, EPOCH = "comparison.json", "epoch.json"

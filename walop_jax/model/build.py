@@ -141,7 +141,7 @@ class _Maker:
         kind = self.kinds.get(self.read.text(table["kind"], "kind", place))
         if kind is None:
             what = f"there is no kind of element {table['kind']!r}; {nearest(table['kind'], self.kinds)} "
-            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs element describes each. "
+            what += f"Kinds are {', '.join(self.kinds)}; walop-jax docs adding-an-instrument describes each. "
             what += f"{self.origin(table['kind'])}, in Python elements=[CLASS] or a FILE.py"
             raise self.read.fault(place, what)
         moves, layers = table.get("moves"), table.get("layers", [])

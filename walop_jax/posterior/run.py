@@ -14,6 +14,7 @@ import numpy as np
 from walop_jax.calibration.calibration import Calibration, Matrix, Product
 from walop_jax.calibration.product import read_product
 from walop_jax.data.calset import read_calibration_set
+from walop_jax.data.clipped import read_clipped
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import model_for
 from walop_jax.fit.parameter_table import Fitted
@@ -21,7 +22,7 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
-from walop_jax.io.names import MODEL, POSTERIOR, PRODUCT
+from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import two_digits
 from walop_jax.likelihood import limits
@@ -96,7 +97,10 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     @functools.cached_property
     def calset(self) -> CalibrationSet:
-        """The data of the fit; `DataError` where the run does not name them, or they are missing or have changed."""
+        """The data of the fit, without the rows that it left out as outliers.
+
+        Raises `DataError` where the run does not name them, or they are missing or have changed.
+        """
         if self.product is None or not (inputs := self.product.inputs):
             advice = "make it with walop-jax refit"
             raise fail("does not name the data of its fit", file=self.folder, advice=advice)
@@ -104,7 +108,10 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         calset = read_calibration_set(*paths, kinds=self.product.design.kinds)
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
-        return calset
+        if CLIPPED not in self:
+            return calset
+        with errors_naming(self.folder / CLIPPED):
+            return read_clipped(self.folder / CLIPPED).taken_from(calset)
 
     def _located(self, path: Path) -> Path:
         beside = self.folder.resolve()

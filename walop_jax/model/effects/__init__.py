@@ -23,7 +23,7 @@ def effect_by_name(name: str, catalogue: Sequence[EffectKind] = EFFECTS) -> Effe
             return effect
     error = unknown_name("effect", name, {effect.name: effect.__doc__ or "" for effect in catalogue})
     raise ValueError(
-        f"{error} (walop-jax docs effect lists all; --effects FILE, in Python effects=, adds your own)"
+        f"{error} (walop-jax docs effects lists all; --effects FILE, in Python effects=, adds your own)"
     )
 
 

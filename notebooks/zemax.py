@@ -1,4 +1,10 @@
-"""Text exports "Polarization Transmission" of an optical design program, made into a calibration set (KIND `flux`).
+"""Make a calibration set (KIND `flux`) of text exports "Polarization Transmission" of an optical design program.
+
+    python zemax.py FOLDER -o SET.fits
+
+reads all text exports (*.txt) in a folder and below it, each once. Every wavelength becomes a monochromatic filter,
+every state of polarisation an exposure; N is 10⁶ times the transmission and N_ERR a share of it. Rows that lack a
+camera are left out, and so are rows with a transmission of exactly 0, with a warning in both cases.
 
 A file holds one configuration of the design in one state of polarisation, some field points, and for each of them
 the transmission at every wavelength and a weighted total; a part on chief rays follows. Read are title,
@@ -17,29 +23,28 @@ Cameras     O1, E1, O2, E2 are the configurations 1, 3, 2, 4 of the WALOP-North 
             is the choice of the set named below: with it m33 is negative over nine tenths of the field, while a
             plate at +22.5° makes it positive. Another design may number its beams otherwise: `configurations`.
 Field       X and Y are those of the program, degrees, signs as they stand.
-Vignetting  A transmission of exactly 0 is a ray bundle that does not arrive: FLAG 4.
+Vignetting  A transmission of exactly 0 is a ray bundle that does not arrive: the row is left out.
 Source      Cameras, order of rows and conventions were found by holding exports of WALOP-North against a calibration
             set that was made of them elsewhere; N agrees to the single precision of that set (test_zemax.py).
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import math
+import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.calset import from_arrays
-from walop_jax.data.records import CalibrationSet, DataFlag, FilterCurve, Site
-from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.instruments.description import described, shipped
-from walop_jax.io.errors import DataError, PathLike, errors_naming, fail
-from walop_jax.io.text import check_input
+import walop_jax as walop
+from walop_jax import CalibrationSet, DataError, FilterCurve
 
 HEADING = "Polarization Transmission Data"
 """First line of every export."""
@@ -85,7 +90,7 @@ class _Block:
     total: Decimal | None = None
 
 
-def read_export(path: PathLike) -> TransmissionExport | None:
+def read_export(path: str | os.PathLike[str]) -> TransmissionExport | None:
     """Read one text export; None for a text that does not begin like one.
 
     UTF-8, UTF-16 with its mark and the one-byte encodings of Windows are read, with any line ends and with a
@@ -116,19 +121,19 @@ def read_export(path: PathLike) -> TransmissionExport | None:
 
 def _lines(path: Path) -> list[str]:
     try:
-        content = check_input(path).read_bytes()
+        content = path.read_bytes()
         marked = content.startswith((b"\xff\xfe", b"\xfe\xff"))
         # All that is read is ASCII, so any one-byte encoding (and UTF-8) may pass for Latin-1.
         text = content.decode("utf-16") if marked else content.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     except OSError as error:
         what = f"cannot be read: {error.strerror or error}"
-        raise fail(what, file=path, advice="look at its rights") from error
+        raise _refused(path, what, "look at its name and its rights") from error
     except UnicodeDecodeError as error:
-        raise fail("is cut off within a letter", file=path, advice=_AGAIN) from error
+        raise _refused(path, "is cut off within a letter", _AGAIN) from error
     if "\0" in text:
-        raise fail("is not a text, or UTF-16 without its mark", file=path, advice="save it as UTF-8")
+        raise _refused(path, "is not a text, or UTF-16 without its mark", "save it as UTF-8")
     if not text.strip():
-        raise fail("is empty", file=path, advice=f"{_AGAIN}, or remove it")
+        raise _refused(path, "is empty", f"{_AGAIN}, or remove it")
     return [line.strip() for line in text.splitlines()]
 
 
@@ -142,7 +147,7 @@ def _header(lines: list[str], offset: int, path: Path) -> tuple[str, int, float]
     folder = _FOLDER.fullmatch(path.parent.name)
     if folder and int(folder[1]) != configurations[0]:
         what = f"says configuration {configurations[0]} in a folder {path.parent.name!r}"
-        raise fail(what, file=path, advice="move it")
+        raise _refused(path, what, "move it")
     title = cards.get("Title", (0, ""))[1]
     if "Field is unpolarized." in lines:
         return title, configurations[0], -math.inf
@@ -209,11 +214,18 @@ def _number(text: str, what: str, path: Path, line: int) -> Decimal:
     return Decimal(text.replace(",", "."))
 
 
+def _refused(place: object, what: str, advice: str) -> DataError:
+    """An error that says where, what, and what to do."""
+    return DataError(f"{place}: {what}; {advice}")
+
+
 def _fault(path: Path, line: int, what: str, advice: str) -> DataError:
-    return fail(what, file=f"{path}, line {line}", advice=advice)
+    return _refused(f"{path}, line {line}", what, advice)
 
 
 # ------------------------------------------------------------------------------------------ made into a calibration set
+
+INSTRUMENT = "WALOP-NORTH"
 
 CAMERA_CONFIGURATIONS = (1, 3, 2, 4)
 """Configurations of the design that are the cameras O1, E1, O2, E2."""
@@ -226,26 +238,36 @@ _CAMERA_NAMES = ("O1", "E1", "O2", "E2")
 
 
 def import_transmissions(
-    folder: PathLike,
+    folder: str | os.PathLike[str],
     *,
-    instrument: str | None = None,
+    instrument: str = INSTRUMENT,
     configurations: Sequence[int] = CAMERA_CONFIGURATIONS,
     error: float = RELATIVE_ERROR,
-    tell: Callable[[str], None] = lambda text: None,
-) -> CalibrationSet:
-    """Make a calibration set (KIND `flux`) of all text exports in a folder and its subfolders.
+) -> tuple[CalibrationSet, list[str]]:
+    """Make a calibration set (KIND `flux`) of all text exports in a folder and its subfolders, with remarks.
 
     An exposure is a wavelength (a filter MONO-<Ångström>) and a state, unpolarised light first; rows that lack a
     camera are left out, exposures and points without any row too. MJD has no meaning, but distinguishes exposures.
-    N_ERR is the share `error` of N, at least the rounding of the printed values. `remarks` list the rows left out.
+    N_ERR is the share `error` of N, at least the rounding of the printed values. The remarks name what was left out.
 
-    `instrument` is a shipped one, by default that which the titles of the exports name; `configurations` are those of
-    the four cameras O1, E1, O2, E2; `tell` receives the progress. Each file is read once.
+    `configurations` are those of the four cameras O1, E1, O2, E2. Each file is read once.
 
     Raises `DataError` as `read_export` does, for data that are there twice, and if nothing can be made of them.
     """
-    exports, remarks = _exports(Path(folder), tell)
-    instrument = _instrument(exports, instrument, Path(folder), remarks)
+    folder = Path(folder)
+    if len(set(configurations)) != 4 or len(configurations) != 4:
+        raise ValueError(
+            f"{configurations} are not four different configurations, as in {CAMERA_CONFIGURATIONS}"
+        )
+    if not 0.0 <= error < 1.0:
+        raise ValueError(f"{error} is not a share of a transmission, as in {RELATIVE_ERROR}")
+    instrument = walop.Instrument.read(
+        instrument
+    ).name  # refuses one that does not exist, with the nearest names
+    exports, remarks = _exports(folder)
+    titles = sorted({export.title for export in exports})
+    if not any(instrument.upper() in title.upper() for title in titles):
+        remarks.append(f"{folder}: {instrument} is not among the titles of the exports ({', '.join(titles)})")
     angles = np.array(sorted({export.angle for export in exports}))
     wavelengths = np.array(sorted({float(w) for export in exports for w in export.wavelength}))
     yx = np.array(sorted({place for e in exports for place in zip(e.y.tolist(), e.x.tolist(), strict=True)}))
@@ -259,10 +281,15 @@ def import_transmissions(
     )
     if not np.any(row):
         advice = "export the same fields and states in all four"
-        raise fail(f"no row has all four cameras, missing are {missing}", file=folder, advice=advice)
+        raise _refused(folder, f"no row has all four cameras, missing are {missing}", advice)
     if not np.all(row):
         what = f"{np.sum(~row)} of {row.size} rows (wavelength, state, field point) are left out because"
         remarks.append(f"{folder}: {what} a camera is missing: {missing}")
+    dark = row & np.any(values == 0, axis=-1)
+    if np.any(dark):
+        what = f"{np.sum(dark)} of {np.sum(row)} rows are left out because a transmission is 0 (vignetted)"
+        remarks.append(f"{folder}: {what}")
+    row &= ~dark
     # Exposures and points without a row are left out too, what remains is numbered anew.
     values[~row] = np.nan
     exposed, places = row.any(axis=-1), row.reshape(-1, len(yx)).any(axis=0)
@@ -270,8 +297,8 @@ def import_transmissions(
     curves = [FilterCurve(f"MONO-{1e4 * w:.0f}", np.array([w]), np.ones(1)) for w in wavelengths]
     colour, state = np.nonzero(exposed)
     y, x = yx[places].T
-    with errors_naming(folder):
-        calset = from_arrays(
+    try:
+        calset = walop.from_arrays(
             counts,
             # A number that was rounded to a step is off by step / √12.
             np.maximum(error * counts, printed / math.sqrt(12.0)),
@@ -280,7 +307,6 @@ def import_transmissions(
             np.where(np.isfinite(angles), angles, np.nan)[state],
             "flux",
             instrument=instrument,
-            site=Site(*described(instrument).place[:4]),
             filters={curve.name: curve for curve in curves},
             origin="optical design program, polarization transmission",
             filter=[curves[number].name for number in colour],
@@ -289,49 +315,24 @@ def import_transmissions(
             temp=20.0,
             ha=0.0,
         )
-    table = TableIntensities.of(calset.intensities, calset.points)
-    dark = np.any(table.counts == 0, axis=-1)
-    if np.any(dark):
-        what = f"{np.sum(dark)} of {len(dark)} rows have a transmission of 0 (vignetted): flagged, not used"
-        remarks.append(f"{folder}: {what}")
-    table = table.flagged(dark, DataFlag.EDGE_OR_VIGNETTED)
-    return dataclasses.replace(calset, intensities=table, remarks=(*remarks, *calset.remarks))
+    except DataError as fault:
+        raise DataError(f"{folder}: {fault}") from fault
+    return calset, [*remarks, *calset.remarks]
 
 
-def _exports(folder: Path, tell: Callable[[str], None]) -> tuple[list[TransmissionExport], list[str]]:
+def _exports(folder: Path) -> tuple[list[TransmissionExport], list[str]]:
     if not folder.is_dir():
-        raise fail("is not a folder", file=folder, advice="give the folder that holds the exports")
+        raise _refused(folder, "is not a folder", "give the folder that holds the exports")
     texts = (f for f in folder.rglob("*") if f.suffix.lower() == ".txt" and f.name[0] != "." and f.is_file())
-    files, read = sorted(texts), list[TransmissionExport | None]()
-    for n, file in enumerate(files):
-        if n % 100 == 0:
-            tell(f"reading {n} of {len(files)} files")
-        read.append(read_export(file))
+    files = sorted(texts)
+    read = [read_export(file) for file in files]
     exports = [export for export in read if export is not None]
     if not exports:
         what = f"none of {len(files)} text files begins with {HEADING!r}"
-        raise fail(what, file=folder, advice="export that analysis as text, in English")
+        raise _refused(folder, what, "export that analysis as text, in English")
     ignored = [file.name for file, export in zip(files, read, strict=True) if export is None]
     what = f"{folder}: {len(ignored)} text files are no exports and not read"
     return exports, [f"{what}, {ignored[0]} for one"] if ignored else []
-
-
-def _instrument(
-    exports: list[TransmissionExport], wanted: str | None, folder: Path, remarks: list[str]
-) -> str:
-    """The instrument that was asked for, or the one that all titles name."""
-    titles = sorted({export.title for export in exports})
-    named = {name for title in titles for name in shipped() if name in title.upper()}
-    if wanted is None and len(named) == 1:
-        return named.pop()
-    if wanted is None:
-        advice = f"say which it is: --instrument {' or '.join(shipped())}"
-        what = f"the titles name {len(named)} instruments ({', '.join(titles)})"
-        raise fail(what, file=folder, advice=advice)
-    if named - {wanted.upper()}:
-        named_by = ", ".join(sorted(named))
-        remarks.append(f"{folder}: the titles name {named_by}, {wanted.upper()} was asked for")
-    return wanted.upper()
 
 
 def _dense(
@@ -348,14 +349,54 @@ def _dense(
     for n, e in enumerate(exports):
         if e.configuration not in configurations:
             advice = f"the cameras are {list(configurations)}: remove the file, or name others (--cameras)"
-            raise fail(f"configuration {e.configuration} is no camera", file=e.path, advice=advice)
+            raise _refused(e.path, f"configuration {e.configuration} is no camera", advice)
         points = [place[key] for key in zip(e.y.tolist(), e.x.tolist(), strict=True)]
         rows = np.searchsorted(wavelengths, e.wavelength), np.searchsorted(angles, [e.angle])
         camera = np.array([configurations.index(e.configuration)])
         at = np.ix_(*rows, np.array(points), camera)
         if np.any(owner[at] >= 0):
-            raise fail(f"holds what stands in {exports[int(owner[at].max())].path} too (configuration, state, "
-                       "field point, wavelength)", file=e.path, advice="remove one of them")  # fmt: skip
+            other = exports[int(owner[at].max())].path
+            what = f"holds what stands in {other} too (configuration, state, field point, wavelength)"
+            raise _refused(e.path, what, "remove one of them")
         values[at], step[at] = (transposed.T[:, None, :, None] for transposed in (e.transmission, e.step))
         owner[at] = n
     return values, step
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """The command line: 0, or 1 with a message for exports that cannot be used."""
+    parser = argparse.ArgumentParser(
+        description="Make a calibration set of exports of an optical design program."
+    )
+    parser.add_argument("folder", metavar="FOLDER", help='folder of "Polarization Transmission" text exports')
+    parser.add_argument(
+        "-o", "--output", metavar="SET.fits", required=True, help="calibration set to write (FITS)"
+    )
+    parser.add_argument("--instrument", default=INSTRUMENT, help="which instrument (default: %(default)s)")
+    cameras = ",".join(map(str, CAMERA_CONFIGURATIONS))
+    help_of_cameras = "configurations of the design that are the cameras (default: %(default)s)"
+    parser.add_argument("--cameras", default=cameras, metavar="O1,E1,O2,E2", help=help_of_cameras)
+    parser.add_argument(
+        "--error", type=float, default=RELATIVE_ERROR, help="error of a transmission, as a share of it"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace a set that exists")
+    given = parser.parse_args(words)
+    try:
+        configurations = [int(number) for number in given.cameras.split(",")]
+        calset, remarks = import_transmissions(
+            given.folder, instrument=given.instrument, configurations=configurations, error=given.error
+        )
+        walop.write_calibration_set(given.output, calset, overwrite=given.overwrite)
+    except ValueError as fault:
+        print(f"zemax.py: error: {fault}", file=sys.stderr)
+        return 1
+    for remark in remarks:
+        print(f"zemax.py: warning: {remark}", file=sys.stderr)
+    exposures, points, rows = len(calset.exposures), len(calset.points), calset.intensities.rows
+    told = f"{len(calset.filters)} wavelengths, {exposures} exposures of {points} points, {rows} rows to use"
+    print(f"{given.output}: {calset.instrument}, {told}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

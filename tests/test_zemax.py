@@ -1,11 +1,14 @@
-"""Text exports of an optical design program: what a calibration set holds of them, and what is refused.
+"""The script `notebooks/zemax.py`: text exports of an optical design program, and what a set holds of them.
 
 Held against numbers typed by hand and, where it lies beside the project, a set made by other code from real exports.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +16,34 @@ from zemax_exports import FIELDS, STATES, export_text, transmission, write_folde
 
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.inspection import inspect
+from walop_jax.data.records import CalibrationSet
 from walop_jax.data.write import write_calibration_set
-from walop_jax.data.zemax import import_transmissions, read_export
 from walop_jax.io.errors import DataError
+
+SCRIPT = Path(__file__).resolve().parents[1] / "notebooks" / "zemax.py"
+
+
+def script():
+    """The script as a module, from its path: it lies beside a notebook and in no package."""
+    spec = importlib.util.spec_from_file_location("zemax", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules["zemax"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+zemax = script()
+read_export = zemax.read_export
+
+
+def import_transmissions(folder, **options) -> CalibrationSet:
+    """The set alone."""
+    return zemax.import_transmissions(folder, **options)[0]
+
+
+def remarks_of(folder, **options) -> list[str]:
+    return zemax.import_transmissions(folder, **options)[1]
 
 
 @pytest.fixture
@@ -29,7 +57,7 @@ def test_outside_exports_give_the_outside_set(shared_data, tmp_path):
     if not folder.is_dir():
         pytest.skip("no text exports beside the project (../shared/data/zemax_text)")
     ours, theirs = import_transmissions(folder), read_calibration_set(shared_data / "walop_north_design.fits")
-    assert ours.remarks == ()
+    assert remarks_of(folder) == []
     assert (len(ours.exposures), len(ours.points), ours.intensities.rows) == (7 * 9, 12, 7 * 9 * 12)
     assert set(ours.filters) == set(theirs.filters) | {"MONO-6600"}
     for name, curve in theirs.filters.items():
@@ -64,8 +92,8 @@ def test_outside_exports_give_the_outside_set(shared_data, tmp_path):
 def test_a_calibration_set(folder, tmp_path):
     calset = import_transmissions(folder)
     e = calset.exposures
-    assert (calset.instrument, calset.remarks) == ("WALOP-NORTH", ())
-    assert calset.site.telescope == "Skinakas 1.3-m"
+    assert calset.instrument == "WALOP-NORTH"
+    assert remarks_of(folder) == []
     assert e.kind.tolist() == ["flux"] * 12
     assert e.filter.tolist() == ["MONO-5400"] * 6 + ["MONO-6600"] * 6
     assert calset.filters["MONO-6600"].wavelength.tolist() == [0.66]
@@ -223,18 +251,17 @@ def test_files_that_are_no_text(content, message, tmp_path):
         read_export(path)
 
 
-def test_a_vignetted_field_point_is_flagged(folder):
-    """One camera dark at one point in unpolarised light, all four in light at 0°."""
+def test_a_vignetted_field_point_is_left_out(folder):
+    """One camera dark at one point in unpolarised light of one wavelength."""
     path = folder / "Unpol" / "Config_3" / "transmission_field1_pol0.txt"
     value = transmission(3, None, 1, 0)
     text = path.read_text(encoding="latin-1")
     assert value in text
     path.write_text(text.replace(value, "0.000000000"), encoding="latin-1")
-    calset = import_transmissions(folder)
-    block = calset.intensities.block(0, 3)
+    block = import_transmissions(folder).intensities.block(0, 3)
     assert np.argwhere(~block.used).tolist() == [[2, 0]]
-    assert calset.intensities.flag.tolist().count(4) == 1
-    assert [remark for remark in calset.remarks if "1 of 36 rows have a transmission of 0" in remark]
+    (remark,) = remarks_of(folder)
+    assert "1 of 36 rows are left out because a transmission is 0 (vignetted)" in remark
 
 
 def test_rows_that_lack_a_camera_are_left_out_and_told(folder):
@@ -242,7 +269,7 @@ def test_rows_that_lack_a_camera_are_left_out_and_told(folder):
     calset = import_transmissions(folder)
     assert np.mod(calset.exposures.clp_angle[1:5], 360).tolist() == pytest.approx([0.0, 45.0, 135.0, 180.0])
     assert calset.intensities.rows == 2 * 5 * 3
-    (remark,) = calset.remarks
+    (remark,) = remarks_of(folder)
     assert "6 of 36 rows" in remark
     assert "0 of E1 (configuration 3), 6 of O2 (configuration 2)" in remark
 
@@ -252,7 +279,7 @@ def test_rows_that_lack_a_camera_are_left_out_and_told(folder):
         (folder / f"Config_{k}" / "transmission_field2_pol1.txt").write_text(text, encoding="latin-1")
     calset = import_transmissions(folder)
     assert len(calset.points) == 3
-    assert "of 48 rows" in calset.remarks[0]
+    assert "of 48 rows" in remarks_of(folder)[0]
     # With the fourth they are, in that state alone.
     text = export_text(4, ("1.0000", "0.0000"), ("0.0500, 0.2000",))
     (folder / "Config_4" / "transmission_field2_pol1.txt").write_text(text, encoding="latin-1")
@@ -293,20 +320,16 @@ def test_names_of_files_mean_nothing(folder, tmp_path):
     (flat / "design.zmx").write_bytes(b"\x00")
     calset, other = import_transmissions(folder), import_transmissions(flat)
     np.testing.assert_array_equal(other.intensities.block(0, 3).counts, calset.intensities.block(0, 3).counts)
-    (remark,) = other.remarks
+    (remark,) = remarks_of(flat)
     assert "1 text files are no exports and not read, notes.txt" in remark
 
 
 def test_every_file_is_read_once(folder, monkeypatch):
-    from pathlib import Path
-
     read: list[str] = []
     original = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(str(path)) or original(path))
-    told: list[str] = []
-    import_transmissions(folder, tell=told.append)
+    import_transmissions(folder)
     assert len(read) == len(set(read)) == 4 * len(STATES)
-    assert told == ["reading 0 of 24 files"]
 
 
 def test_other_cameras(folder):
@@ -319,19 +342,20 @@ def test_other_cameras(folder):
 
 
 def test_which_instrument(folder):
-    for path in folder.rglob("*.txt"):
-        path.write_text(
-            path.read_text(encoding="latin-1").replace("WALOP-North", "polarimeter"), encoding="latin-1"
-        )
-    with pytest.raises(DataError, match=r"name 0 instruments \(polarimeter\); .*--instrument WALOP-LAB or"):
-        import_transmissions(folder)
-    assert import_transmissions(folder, instrument="walop-south").instrument == "WALOP-SOUTH"
+    assert import_transmissions(folder, instrument="WALOP-SOUTH").instrument == "WALOP-SOUTH"
+    (remark,) = remarks_of(folder, instrument="WALOP-SOUTH")
+    assert "WALOP-SOUTH is not among the titles of the exports (WALOP-North)" in remark
     with pytest.raises(DataError, match="WALOP-NORTH"):
         import_transmissions(folder, instrument="WALOP-NORT")
-    path = folder / "Config_1" / "transmission_field1_pol2.txt"
-    path.write_text(export_text(1, ("0.7071", "0.7071")), encoding="latin-1")
-    calset = import_transmissions(folder, instrument="WALOP-SOUTH")
-    assert "the titles name WALOP-NORTH, WALOP-SOUTH was asked for" in calset.remarks[0]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"configurations": (1, 2, 3)}, {"configurations": (1, 3, 2, 2)}, {"error": -1.0}, {"error": np.nan}],
+)
+def test_options_that_cannot_be_meant(folder, options):
+    with pytest.raises(ValueError, match=r"are not four different|is not a share"):
+        import_transmissions(folder, **options)
 
 
 def test_points_outside_the_field(folder):
@@ -348,3 +372,39 @@ def test_folders_without_exports(tmp_path):
         import_transmissions(tmp_path / "none")
     with pytest.raises(DataError, match="none of 0 text files begins with"):
         import_transmissions(tmp_path)
+
+
+# ----------------------------------------------------------------------------------------- the command line
+
+
+def test_a_set_that_other_commands_read(folder, tmp_path, capsys):
+    output = tmp_path / "design.fits"
+    assert zemax.main([str(folder), "-o", str(output)]) == 0
+    told = capsys.readouterr()
+    assert told.out == f"{output}: WALOP-NORTH, 2 wavelengths, 12 exposures of 3 points, 36 rows to use\n"
+    assert told.err == ""
+    assert set(read_calibration_set(output).filters) == {"MONO-5400", "MONO-6600"}
+
+
+def test_options_and_warnings(folder, tmp_path, capsys):
+    (folder / "Config_2" / "transmission_field1_pol3.txt").unlink()
+    output = tmp_path / "design.fits"
+    output.write_text("mine")
+    words = [str(folder), "-o", str(output), "--cameras", "1, 3, 4, 2", "--error", "0.01"]
+    assert zemax.main(words) == 1
+    assert output.read_text() == "mine"
+    assert zemax.main([*words, "--overwrite"]) == 0
+    assert "zemax.py: warning: " in (told := capsys.readouterr().err)
+    assert "6 of E2 (configuration 2)" in told
+    block = read_calibration_set(output).intensities.block(0, 3)
+    assert block.sigma[0, 0] == pytest.approx(0.01 * block.counts[0, 0])
+
+
+@pytest.mark.parametrize("words", [(), ("--cameras", "O1,E1,O2,E2"), ("--instrument", "WALOP-EAST")])
+def test_nothing_is_half_written(folder, tmp_path, capsys, words):
+    if not words:  # an export that is cut off
+        path = folder / "Config_1" / "transmission_field1_pol2.txt"
+        path.write_text(path.read_text(encoding="latin-1")[:700], encoding="latin-1")
+    assert zemax.main([str(folder), "-o", str(tmp_path / "design.fits"), *words]) == 1
+    assert capsys.readouterr().err.startswith("zemax.py: error: ")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["exports"]

@@ -1,23 +1,29 @@
-"""The pack of questions: its answers by hand, the package put to it, mistakes named, tables written and judged."""
+"""The questions on conventions that come with the package (`docs/questions`), for it and for other programs.
+
+Their answers are held against numbers by hand and against the functions of the package; the answers of the usual
+mistakes have to differ from the right ones.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.commands.conformance import conformance
-from walop_jax.io.errors import DataError
+import walop_jax
 from walop_jax.model.mueller import retarder
 from walop_jax.model.sources import turned
-from walop_jax.science import conformance as science
-from walop_jax.science.conformance import RESULTS, SHIPPED, rows, values
 from walop_jax.science.estimate import estimate
 from walop_jax.science.polarisation import polarisation
+
+PACK = Path(walop_jax.__file__).parent / "docs" / "questions"
+ANGLES = ("EVPA", "EVPA_SKY")  # degrees, the same after half a turn
+Key = tuple[str, str]  # a case and a quantity
 
 BY_HAND = {
     ("sign-of-u-3", "EVPA"): 45.0,
@@ -54,24 +60,38 @@ class Case(NamedTuple):
     mistakes: dict[str, dict[str, float]]
 
 
+def rows(name: str) -> list[dict[str, str]]:
+    """The rows of a table that comes with the package."""
+    with (PACK / name).open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def values(name: str) -> dict[Key, float]:
+    """The numbers of such a table by case and quantity."""
+    return {(row["CASE"], row["QUANTITY"]): float(row["VALUE"]) for row in rows(name)}
+
+
 def cases() -> list[Case]:
     """The questions as the package holds them."""
     made = {row["CASE"]: Case(row["CASE"], row["TOPIC"], {}, {}, {}) for row in rows("cases.csv")}
     for file in ("given", "answers"):
         for (case, quantity), value in values(f"{file}.csv").items():
             getattr(made[case], file)[quantity] = value
-    for row in rows("mistakes.csv"):
-        wrong = made[row["CASE"]].mistakes.setdefault(row["MISTAKE"], {})
+    for row in rows("wrong_answers.csv"):
+        wrong = made[row["CASE"]].mistakes.setdefault(row["CAUSE"], {})
         wrong[row["QUANTITY"]] = float(row["VALUE"])
     return list(made.values())
 
 
-def judge(answers):
-    return science.judge(answers).deviations
+def same(quantity: str, answer: float, expected: float) -> bool:
+    """True if two numbers agree as docs/conventions asks for: to 10⁻⁶, angles to 10⁻⁵ degrees, modulo 180."""
+    if quantity in ANGLES:
+        return abs((answer - expected + 90.0) % 180.0 - 90.0) < 1e-5
+    return abs(answer - expected) <= 1e-6 * abs(expected) + 1e-12
 
 
-def right() -> dict[tuple[str, str], float | None]:
-    return {(case.name, quantity): value for case in cases() for quantity, value in case.answers.items()}
+def right() -> dict[Key, float]:
+    return values("answers.csv")
 
 
 def test_questions_with_answers_known_by_hand():
@@ -128,88 +148,45 @@ PACKAGE = ("parity", "covariance", "two cameras")
 
 
 def test_the_package_answers_right():
-    answers = right()
+    expected = right()
     for case in cases():
         if case.topic not in PACKAGE:
             found = by_package(case)
             assert found.keys() == case.answers.keys()
-            answers |= {(case.name, name): value for name, value in found.items()}
-    assert judge(answers) == ()
+            for name, value in found.items():
+                assert same(name, value, expected[case.name, name]), (case.name, name, value)
 
 
-def test_mistakes_are_told_from_the_right_answer_and_named():
-    seen = set()
+def test_a_mistake_answers_otherwise_than_is_right():
+    """In one case of its topic at least: an answer that two conventions share is no test of them."""
+    told = set()
     for case in cases():
-        for text, wrong in case.mistakes.items():
-            answers = right() | {(case.name, name): value for name, value in wrong.items()}
-            deviations = judge(answers)
-            if deviations:
-                assert all(entry.case == case.name and entry.mistake for entry in deviations)
-                seen |= {(case.topic, text)} & {(case.topic, entry.mistake) for entry in deviations}
-    assert seen == {(case.topic, text) for case in cases() for text in case.mistakes}
+        for mistake, wrong in case.mistakes.items():
+            assert wrong.keys() <= case.answers.keys()
+            if any(not same(name, value, case.answers[name]) for name, value in wrong.items()):
+                told.add((case.topic, mistake))
+    assert told == {(case.topic, mistake) for case in cases() for mistake in case.mistakes}
 
 
-def test_an_angle_is_the_same_after_half_a_turn_and_nothing_is_no_answer():
-    answers = right()
-    answers["sign-of-u-1", "EVPA"] = 180.0
-    assert judge(answers) == ()
-    answers["sign-of-u-1", "EVPA"] = 179.9
-    answers["roll-1", "Q_SKY"] = None
-    answers["roll-1", "U_SKY"] = float("nan")
-    told = [str(entry) for entry in judge(answers)]
-    assert len(told) == 3
-    assert "sign-of-u-1 EVPA: 179.9 where 0 is right" in told
-    assert "roll-1 Q_SKY: no answer" in told
+def test_mistakes_of_a_topic_are_told_from_each_other():
+    """Over all cases of a topic no two mistakes give the same answers, so that the answers say which one was made."""
+    by_topic: dict[str, dict[str, dict[Key, float]]] = {}
+    for case in cases():
+        for mistake, wrong in case.mistakes.items():
+            answers = {(case.name, name): wrong.get(name, value) for name, value in case.answers.items()}
+            by_topic.setdefault(case.topic, {}).setdefault(mistake, {}).update(answers)
+    for mistakes in by_topic.values():
+        names = list(mistakes)
+        for number, first in enumerate(names):
+            for second in names[number + 1 :]:
+                one, other = mistakes[first], mistakes[second]
+                assert one.keys() == other.keys()
+                assert not all(same(name[1], one[name], other[name]) for name in one), (first, second)
 
 
-def fill(folder, change):
-    """Answers from answers.csv into results.csv, changed."""
-    with (folder / "answers.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    for number, row in enumerate(rows):
-        change(number, row)
-    with (folder / "results.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, ["CASE", "QUANTITY", "VALUE"])
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def test_tables_are_written_and_judged(tmp_path):
-    folder = tmp_path / "pack"
-    assert conformance(make=folder) == 43
-    assert sorted(entry.name for entry in folder.iterdir()) == sorted((*SHIPPED, RESULTS))
-    asked = len(right())
-    empty = conformance(check=folder)
-    assert len(empty.deviations) == asked
-    fill(folder, lambda number, row: None)
-    assert conformance(check=folder).document() == {"asked": asked, "right": asked, "deviations": []}
-    # Nothing filled in is said once, and so is one mistake made everywhere.
-    assert len(empty.display().notes) == 1
-    half = {
-        case.name: case.mistakes["O2 and E2 are exchanged"]
-        for case in cases()
-        if case.topic == "camera order"
-    }
-    swap = lambda number, row: row.update(VALUE=half.get(row["CASE"], {}).get(row["QUANTITY"], row["VALUE"]))  # noqa: E731
-    fill(folder, swap)
-    (told,) = conformance(check=folder).display().notes
-    assert told.startswith("O2 and E2 are exchanged: camera-order-1 U, camera-order-1 EVPA")
-    fill(folder, lambda number, row: row.update(VALUE="-0.017") if number == 0 else None)
-    assert [entry.quantity for entry in conformance(check=folder).deviations] == ["P"]
-    with pytest.raises(DataError, match=r"holds cases\.csv already"):
-        conformance(make=folder)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"CASE": "sing-of-u-1"}, r"results\.csv: 'sing-of-u-1 P' is not asked for, in row 0.*sign-of-u-1 P"),
-        ({"QUANTITY": "EVPA"}, r"sign-of-u-1 EVPA is there twice, again in row 1"),
-        ({"VALUE": "45 deg"}, r"VALUE: '45 deg' is not a number, in row 0"),
-    ],
-)
-def test_results_that_cannot_be_read(tmp_path, change, message):
-    conformance(make=tmp_path / "pack")
-    fill(tmp_path / "pack", lambda number, row: row.update(change) if number == 0 else None)
-    with pytest.raises(DataError, match=message):
-        conformance(check=tmp_path / "pack")
+def test_the_tables_hold_the_same_cases():
+    """Every question has numbers and answers, in the order in which they are asked, and none is there twice."""
+    asked = [row["CASE"] for row in rows("cases.csv")]
+    for table in ("given.csv", "answers.csv"):
+        assert list(dict.fromkeys(case for case, _ in values(table))) == asked
+        assert len(values(table)) == len(rows(table))
