@@ -31,6 +31,15 @@ class Element(Component):
     `period` is the change of a reading (the number in `<P>_ANGLE`) after which an element that moves acts as before:
     360 for an angle in degrees, None for a reading that never repeats itself, such as a voltage. A class that writes
     `turned` or `position` anew and says nothing of its period has None, which is right for every reading.
+
+    >>> class Dimmer(walop.Element):
+    ...     "A filter that is grey."
+    ...     density: walop.Scalar = walop.number("", "optical density")
+    ...     kind = "dimmer"
+    ...     def mueller(self, ray):
+    ...         return 10.0 ** -self.density * np.eye(4)
+    >>> Dimmer(density=1.0).mueller(None)[0, 0]
+    Array(0.1, dtype=float64)
     """
 
     name: str = eqx.field(static=True, default="")
