@@ -49,16 +49,34 @@ def in_units(first) -> dict[str, Any]:
     return names
 
 
+@pytest.fixture
+def kept_apart(tmp_path, monkeypatch):
+    """Scripts write into a folder of their own, which is also their home; JAX is configured as before afterwards."""
+    import jax
+
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
 def test_scripts_are_short_and_use_public_names():
     assert list(SCRIPTS) == [
+        "Compilation, precision and saving",
         "Gradient and Jacobian",
         "Many instruments at once",
+        "Many sets at once",
         UNITS,
         "A fit by optimistix",
         "A fit by optax",
         "NUTS of blackjax",
         "numpyro",
         "A likelihood of your own",
+        "Another prior in the place of one",
+        "The evidence by Laplace's method",
         "Sensitivity maps",
         "A forecast from a plan",
     ]
@@ -69,7 +87,7 @@ def test_scripts_are_short_and_use_public_names():
 @pytest.mark.parametrize(
     "title", quick(SCRIPTS, ["Many instruments at once", "Sensitivity maps", "A forecast from a plan"])
 )
-def test_it_runs(title: str, first, request: pytest.FixtureRequest):
+def test_it_runs(title: str, first, request: pytest.FixtureRequest, kept_apart):
     name = OPTIONAL.get(title)
     if name and importlib.util.find_spec(name) is None:
         pytest.skip(f"{name} is not installed")
@@ -98,5 +116,32 @@ def checks(title: str, names: dict[str, Any]) -> None:
     if title == "A forecast from a plan":
         i = names["planned"].names.index("half2.plate.mgf2")
         assert 0.5 * sigma[i] < float(names["error"][i]) < 2.0 * sigma[i]
+    if title == "Compilation, precision and saving":
+        assert float(names["again"].chi2(result.values)) == float(names["forward"].chi2(result.values))
+    if title == "Many sets at once":
+        each = [float(one.chi2(one.start)) for one in names["each"]]
+        assert np.asarray(names["chi2"](names["stacked"])) == pytest.approx(each, rel=1e-12)
+        assert len({round(value) for value in each}) == len(each)
+    if title == "Another prior in the place of one":
+        values, (at, mean, width) = result.values, map(np.asarray, names["forward"].prior)
+        plates = np.isin(at, names["plates"])
+        pulls = (values[at[plates]] - mean[plates]) / width[plates]
+        apart = values[np.asarray(names["plates"])] - 1929.0
+        make = np.sum(-0.5 * (apart / np.exp(0.3)) ** 2 - 0.3 - 0.5 * np.log(2 * np.pi))
+        expected = float(names["forward"].log_density(values)) + 0.5 * np.sum(pulls**2) + make
+        assert plates.sum() == 2
+        assert float(names["hierarchical"](values, 1929.0, 0.3)) == pytest.approx(expected, rel=1e-12)
+    if title == "The evidence by Laplace's method":
+        # Savage and Dickey: the Bayes factor against a number held at a value is prior over posterior density there.
+        wider, calset = names["wider"], names["calset"]
+        refitted = names["walop"].refit(calset, wider)
+        (extra,) = wider.positions("hwp2_axis")
+        prior = wider.parameters[extra].prior
+        error = np.sqrt(refitted.covariance[extra, extra])
+        density = [
+            -0.5 * (z / s) ** 2 - np.log(s) for z, s in ((0.0, prior[1]), (refitted.values[extra], error))
+        ]
+        found = float(names["evidence"](wider) - names["evidence"](names["model"]))
+        assert found == pytest.approx(density[0] - density[1], abs=0.02)
     if title == "NUTS of blackjax":
         assert float(names["acceptance"].mean()) > 0.5

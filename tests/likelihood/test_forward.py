@@ -129,6 +129,48 @@ def test_gradients_of_the_instrument_come_back_as_one(scene: Forward):
     assert float(gradient.element(place).axis) == pytest.approx(float(slope), rel=1e-5)
 
 
+def test_numbers_in_float32_are_refused(scene: Forward):
+    """Their digits are lost already, and a gradient would have no more: an error that says what to write."""
+    single = scene.start.astype(jnp.float32)
+    trees = (jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scene.instrument(scene.start)),)
+    for values in (single, np.asarray(single), *trees):
+        for function in (
+            scene.log_likelihood,
+            jax.grad(scene.chi2, allow_int=True),
+            jax.jit(scene.residuals),
+        ):
+            with pytest.raises(TypeError, match=r"float32.*give jnp\.asarray\(values, jnp\.float64\)"):
+                function(values)
+    for function in (scene.log_prior, scene.instrument, lambda v: scene.full(v[scene.free])):
+        with pytest.raises(TypeError, match="was given numbers in float32"):
+            function(single)
+    with pytest.raises(TypeError, match="was given numbers in float32"):
+        scene.values({scene.names[0]: single[0]})
+    rounded = dataclasses.replace(scene, data=jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scene.data))
+    with pytest.raises(TypeError, match="was given numbers in float32"):
+        rounded.log_density(scene.start)
+    with pytest.raises(TypeError, match="was given numbers in bfloat16"):
+        scene.log_density(scene.start.astype(jnp.bfloat16))
+    assert scene.log_prior(np.asarray(scene.start)) == scene.log_prior(list(map(float, scene.start)))
+
+
+@pytest.mark.parametrize("form", ["value", "gradient", "several"])
+def test_a_plain_call_is_compiled_once(scene: Forward, form: str):
+    """Without `jax.jit` the first call compiles, and later ones do not trace anything of the instrument."""
+    forms = {"value": scene.log_density, "gradient": jax.grad(scene.log_density)}
+    function = forms.get(form, jax.vmap(scene.log_density))
+    values = scene.start if form != "several" else jnp.stack([scene.start, scene.start + 1e-6])
+    first = function(values)
+    with pytest.MonkeyPatch.context() as patch:
+
+        def traced(*_: Any) -> Any:
+            raise AssertionError("the instrument is traced again")
+
+        patch.setattr(Forward, "_unit", traced)
+        again = function(values + 0.0)
+    np.testing.assert_array_equal(again, first)
+
+
 def test_ties_hold_whatever_stands_in_their_place():
     calset = small_fit().calset
     model = base_model(calset).change("half2.plate.mgf2", tie="half1.plate.mgf2")

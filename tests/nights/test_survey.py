@@ -366,7 +366,8 @@ def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):
     from walop_jax.commands.docs import pages
 
     blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", pages()["nights"], re.MULTILINE)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
+    blocks = [block for block in blocks if "dask_jobqueue" not in block]  # which needs a cluster
     monkeypatch.chdir(tmp_path)
     for k, calset in enumerate(sets[:3], 1):
         walop.write_calibration_set(tmp_path / f"night{k}.fits", calset)

@@ -115,11 +115,15 @@ class AnalysisVectors:
     def reduced(self, settings: Settings) -> Settings:
         """The settings, equal where these optics are: fewer distinct ones."""
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
+        patched = self.instrument.patched()
         return dataclasses.replace(
             settings,
             temperature=settings.temperature if "temperature" in depends else neutral.temperature,
             hour_angle=settings.hour_angle if "hour_angle" in depends else neutral.hour_angle,
-            positions={prefix: np.mod(angle, 360.0) for prefix, angle in settings.positions.items()},
+            positions={
+                prefix: patched.within_period(prefix, reading)
+                for prefix, reading in settings.positions.items()
+            },
         )
 
     def at(self, setting: Settings, x: Vector, y: Vector) -> Float[np.ndarray, "p c k 3"]:

@@ -14,6 +14,9 @@ from walop_jax.simulation.simulate import as_planned
 def forward(calset: CalibrationSet | ObservingPlan, model: Model | None = None) -> Forward:
     """Counts, residuals and posterior density of a calibration set as differentiable functions of the parameters.
 
+    Each function is compiled at its first call (seconds) and runs in milliseconds from the second call on; it composes
+    with `jax.jit`, `grad` and `vmap`. Values are in float64, others are refused.
+
     `model` is the base model of the set where it is None. A plan stands for the set that the instrument as designed
     would give, without noise and with the errors that its counts would have. Raises as `base_model` does, and
     RuntimeError when float64 is switched off.

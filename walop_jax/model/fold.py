@@ -39,12 +39,12 @@ class Turning(NamedTuple):
     middle: float
     turn: float
 
-    def angles(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Angles (deg) of the mean, and their weights."""
-        remainder = self.turn % 360.0
+    def angles(self, period: float | None = 360.0) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Angles (deg) of the mean, and their weights; `period` is that of the element, None where nothing repeats."""
+        remainder = self.turn if period is None else self.turn % period
         full_turns = self.turn - remainder
         start = self.middle - self.turn / 2.0
-        at = start + 360.0 / WHOLE * np.arange(WHOLE) if full_turns else np.zeros(0)
+        at = start + period / WHOLE * np.arange(WHOLE) if period and full_turns else np.zeros(0)
         weight = np.full(len(at), full_turns / self.turn / WHOLE)
         if remainder:
             nodes, shares = np.polynomial.legendre.leggauss(FEWEST + int(PER_RADIAN * np.deg2rad(remainder)))
@@ -110,7 +110,7 @@ class Fold(NamedTuple):
     def solved(self) -> Solved:
         """Mueller matrices of all stations at all their positions."""
         cases: list[tuple[tuple[int, float | None], Element, Ray]] = []
-        means: list[tuple[int, Turning]] = []
+        means: list[tuple[int, float | None, Turning]] = []
         for number, (element, ray) in enumerate(self.stations):
             if element.moves is None:
                 cases.append(((number, None), element, ray))
@@ -118,9 +118,9 @@ class Fold(NamedTuple):
             places = positions(element, self.moving, self.states)
             occurring = dict.fromkeys(angle for angle in places if angle is not None)
             turning = [at for at in occurring if isinstance(at, Turning)]
-            means += [(number, at) for at in turning]
+            means += [(number, element.period, at) for at in turning]
             angles = {at for at in occurring if not isinstance(at, Turning)}.union(
-                *(at.angles()[0].tolist() for at in turning)
+                *(at.angles(element.period)[0].tolist() for at in turning)
             )
             cases += [((number, angle), element.turned(angle), ray) for angle in sorted(angles)]
         result: Solved = {}
@@ -128,8 +128,8 @@ class Fold(NamedTuple):
             members = [case for case in cases if type(case[1]) is kind]
             matrices = kind.solved([(element, ray) for _, element, ray in members])
             result.update({key: matrix for (key, _, _), matrix in zip(members, matrices, strict=True)})
-        for number, at in means:
-            angles, weights = at.angles()
+        for number, period, at in means:
+            angles, weights = at.angles(period)
             acting = [matrix for angle in angles.tolist() if (matrix := result[number, angle]) is not None]
             result[number, at] = jnp.tensordot(jnp.asarray(weights), jnp.stack(acting), 1) if acting else None
         return result

@@ -15,6 +15,8 @@ from typing import Any, Self, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from walop_jax.io.errors import nearest
 from walop_jax.model.cameras import Cameras, Throughput
@@ -140,6 +142,16 @@ class LightPath(Component):
         """Prefixes of the columns of the moving elements behind the polariser, common train first."""
         elements = (e for e in self.ahead_of_analysers() if not isinstance(e, Polariser))
         return tuple(dict.fromkeys(element.moves for element in elements if element.moves))
+
+    def within_period(self, prefix: str, readings: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Readings of the elements that move together as `prefix`, reduced to one period (`Element.period`).
+
+        Readings with which the optics are the same become equal: 10 and 370 for a plate in degrees. Readings come back
+        as they are where they do not repeat themselves (a voltage) or the elements do not agree in their periods.
+        """
+        periods = {element.period for element in self.ahead_of_analysers() if element.moves == prefix}
+        period = periods.pop() if len(periods) == 1 else None
+        return readings if period is None else np.mod(readings, period)
 
     @property
     def plates(self) -> str | None:

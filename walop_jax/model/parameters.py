@@ -125,6 +125,11 @@ def number(unit: str, about: str, *, default: float | None = 0.0) -> Any:
     """Declare a number of an Equinox module, optionally a parameter in a description.
 
     Values become float64 arrays; None stays, for an absent number.
+
+    >>> class Sheet(walop.Element):
+    ...     thickness: walop.Scalar = walop.number("um", "thickness", default=50.0)
+    >>> Sheet().thickness
+    Array(50., dtype=float64)
     """
     metadata = {NUMBER: Parameter("", unit, about, ""), SEVERAL: False}
     return eqx.field(metadata=metadata, converter=as_number, default=default)

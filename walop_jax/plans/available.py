@@ -280,15 +280,16 @@ def plan_beside(prior: Calibration) -> ObservingPlan:
     Raises `DataError` for one that stood at too many angles; the calibration plate is left to the plan.
     """
     others = (prefix for prefix in prior.design.moving() if prefix != CALIBRATION_PLATE)
-    moving = {prefix: _stood_at(prior.exposures, prefix) for prefix in others}
+    moving = {prefix: _stood_at(prior, prefix) for prefix in others}
     design = prior.design if prior.design.description else prior.instrument
     return ObservingPlan(design, moving=moving)
 
 
-def _stood_at(exposures: Exposures, prefix: str) -> tuple[float | None, ...]:
-    """Angles (deg, None: out) at which a moving element stood in the exposures of a calibration."""
-    position = exposures.position(prefix)
-    stood = np.unique(np.where(position.inside, np.mod(position.angle, 360.0).round(3), np.nan))
+def _stood_at(prior: Calibration, prefix: str) -> tuple[float | None, ...]:
+    """Readings (angles in deg; None: out) of a moving element in the exposures of a calibration."""
+    position = prior.exposures.position(prefix)
+    reading = prior.design.within_period(prefix, position.angle).round(3)
+    stood = np.unique(np.where(position.inside, reading, np.nan))
     if len(stood) > MOST_ANGLES:
         advice = f"say moving = {{ {prefix} = [0, 22.5, 45] }} in a plan, and give --candidates PLAN.toml"
         raise fail(f"{prefix} stood at {len(stood)} angles, more than could be tried", advice=advice)

@@ -116,7 +116,7 @@ def read_catalogue(
     stated = str(source.table.meta.get("INSTRUME", instrument.name))
     if stated.upper() != instrument.name.upper():
         source.remarks.append(f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
-    copy, repeated = _copies(source, points, counts, sigma, rotator, star)
+    copy, repeated = _copies(source, instrument, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(
         points=points,
@@ -271,7 +271,13 @@ def _by_position(source: InputTable, points: FieldPoints) -> Numbers:
 
 
 def _copies(
-    source: InputTable, points: FieldPoints, counts: Counts, sigma: Counts, rotator: OfRows, star: Numbers
+    source: InputTable,
+    instrument: Instrument,
+    points: FieldPoints,
+    counts: Counts,
+    sigma: Counts,
+    rotator: OfRows,
+    star: Numbers,
 ) -> tuple[Chosen, Chosen]:
     """Rows that repeat one of their star, and rows with the position and counts of another star or setting.
 
@@ -293,10 +299,10 @@ def _copies(
     if np.bincount(same[measured], minlength=1).max() < 2:
         return copy, repeated
     settings = points.settings
-    angles = [np.mod(angle, 360.0) for angle in (*settings.positions.values(), rotator)]
+    places = [instrument.within_period(prefix, at) for prefix, at in settings.positions.items()]
     _, band = np.unique(settings.filter, return_inverse=True)
     order = np.argsort(-counted.sum(axis=1), kind="stable")
-    group = equal_rows([same, star, band.reshape(-1), *angles])
+    group = equal_rows([same, star, band.reshape(-1), *places, np.mod(rotator, 360.0)])
     first = order[np.unique(group[order], return_index=True)[1]]
     copy = measured & ~np.isin(np.arange(len(star)), first)
     repeated = measured & (np.bincount(same[measured & ~copy], minlength=len(star))[same] > 1)

@@ -24,8 +24,7 @@ from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import Component, Parameter, field_declarations, unknown_name
-
-Scalar = Float[Array, ""]
+from walop_jax.model.parameters import Scalar as Scalar
 
 
 class Context(NamedTuple):

@@ -27,6 +27,19 @@ class Element(Component):
 
     `declared` holds the parameters of the instrument among its numbers, by field. `path_difference` (µm) is the largest
     optical path between interfering waves: the wavelength nodes must follow its fringes.
+
+    `period` is the change of a reading (the number in `<P>_ANGLE`) after which an element that moves acts as before:
+    360 for an angle in degrees, None for a reading that never repeats itself, such as a voltage. A class that writes
+    `turned` or `position` anew and says nothing of its period has None, which is right for every reading.
+
+    >>> class Dimmer(walop.Element):
+    ...     "A filter that is grey."
+    ...     density: walop.Scalar = walop.number("", "optical density")
+    ...     kind = "dimmer"
+    ...     def mueller(self, ray):
+    ...         return 10.0 ** -self.density * np.eye(4)
+    >>> Dimmer(density=1.0).mueller(None)[0, 0]
+    Array(0.1, dtype=float64)
     """
 
     name: str = eqx.field(static=True, default="")
@@ -35,6 +48,14 @@ class Element(Component):
 
     kind: ClassVar[str] = ""
     reference: ClassVar[str] = ""
+    period: ClassVar[float | None] = 360.0
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Nothing is known of the period of a class that gives readings a meaning of its own."""
+        super().__init_subclass__(**options)
+        own = vars(cls)
+        if "period" not in own and ("turned" in own or "position" in own):
+            cls.period = None
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the element."""
