@@ -88,10 +88,11 @@ def _table(columns):
     return QTable(columns)
 
 
-def four(stars, folder: Path, write=ldac, seed=5, **options) -> list[Path]:
-    """The files of the four cameras."""
-    rng = np.random.default_rng(seed)
+def four(stars, folder: Path, write=ldac, seed=5, words=None, **options) -> list[Path]:
+    """The files of the four cameras; `words` are those of the headers of LDAC in place of the pointing."""
+    rng, more = np.random.default_rng(seed), () if words is None else (words,)
     end = {ldac: "fits", ascii_head: "cat", photutils: "ecsv"}[write]
     return [
-        write(folder / f"{name}.{end}", of_camera(stars, k, rng, **options)) for k, name in enumerate(CAMERAS)
+        write(folder / f"{name}.{end}", of_camera(stars, k, rng, **options), *more)
+        for k, name in enumerate(CAMERAS)
     ]

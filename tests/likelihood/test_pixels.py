@@ -17,6 +17,7 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.frames import RowReader, float64
 from walop_jax.data.grid import Grid
 from walop_jax.data.merge import merge_calibration_sets, without_frames
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.write import write_calibration_set
 from walop_jax.diagnosis.trust import examined, pixel_structure
 from walop_jax.fit.base_model import base_model
@@ -106,6 +107,24 @@ def test_flagged_pixels_and_other_types_are_as_before(path, likelihood, truth_va
     calset = read_calibration_set(tmp_path / "flagged.fits")
     other = Likelihood.of(calset, likelihood.model, interpolate=True)
     assert_same(expand_pixels(other, truth_values), other.expand(truth_values))
+
+
+def test_the_floor_of_the_errors_counts_for_pixels_as_for_points_of_a_table(likelihood, truth_values):
+    """With a floor of 1 % of the light, ten times the noise of photons, in cameras of whole frames and of a table."""
+    template = likelihood.model.template
+    cameras = dataclasses.replace(template.cameras, floor=0.01)
+    model = dataclasses.replace(likelihood.model, template=dataclasses.replace(template, cameras=cameras))
+    calset = likelihood.calset
+    of_table = dataclasses.replace(calset, intensities=TableIntensities.of(calset.intensities, calset.points))
+    reference = Likelihood.of(of_table, model, interpolate=True).expand(truth_values)
+    ours = expand_pixels(Likelihood.of(calset, model, interpolate=True), truth_values)
+    assert_same(ours, reference)
+    assert reference.data < 0.1 * expand_pixels(likelihood, truth_values).data
+    standing = compressed(
+        ours
+    )  # whose points stand for many pixels, each with its floor: none is added to their sum
+    again = Likelihood.of(standing, model, interpolate=False).expand(truth_values)
+    np.testing.assert_allclose(np.diag(again.matrix), np.diag(ours.matrix), rtol=0.02)
 
 
 def test_the_words_of_a_file_are_its_numbers(path, likelihood):

@@ -120,7 +120,7 @@ def test_stars_that_two_cameras_see_are_left_out_and_close_ones_are_marked(tmp_p
 def test_flags_are_those_of_the_package_and_others_are_refused(tmp_path):
     columns = of_camera(STARS, 0, np.random.default_rng(0))
     columns["FLAGS"][:6] = [3, 4, 8, 16, 32, 5]
-    one = read_camera_catalogue(ldac(tmp_path / "a.fits", columns))
+    one = read_camera_catalogue(ldac(tmp_path / "a.fits", columns), drop_blends=True)
     assert one.flag[:7].tolist() == [8, 1, 4, 2, 0, 9, 0]
     columns["FLAGS"][3] = 1024
     with pytest.raises(DataError, match=r"FLAGS: is 1024 in row 3 .*no flag of SExtractor; .*--columns"):
@@ -375,14 +375,15 @@ def test_catalogues_of_different_exposures_are_refused(tmp_path):
     assert np.all(walop.gather(files)["MJD"] == 61000.1)
     rewritten(files, 3, lambda columns: None, {**CENTRE, "MJD": 61000.2})
     with pytest.raises(
-        DataError, match=r"MJD is 61000.1 and 61000.1001 and 61000.2 in catalogues of one exposure"
+        DataError,
+        match=r"MJD is 61000.1 \(.*O1.fits\) and 61000.1001 .* and 61000.2 \(.*\) in catalogues of one exp",
     ):
         walop.gather(files)
     for k, temperature in enumerate((10.0, 10.1, 10.0, 9.9)):  # of sensors beside each other
         rewritten(files, k, lambda columns: None, {**CENTRE, "TEMP": temperature})
     assert np.all(walop.gather(files)["TEMP"] == 10.0)
     rewritten(files, 3, lambda columns: None, {**CENTRE, "TEMP": "cold"})
-    with pytest.raises(DataError, match=r"TEMP is 10.0 and 10.1 and cold in catalogues of one exposure"):
+    with pytest.raises(DataError, match=r"TEMP is 10.0 .* and cold \(.*E2.fits\) in catalogues of one"):
         walop.gather(files)
 
 
@@ -411,7 +412,8 @@ def test_a_field_with_one_or_two_stars(count, tmp_path):
 )
 def test_the_pointing_of_a_header(words, message, tmp_path):
     files = four(STARS, tmp_path)
-    rewritten(files, 0, lambda columns: None, words)
+    for k in range(4):
+        rewritten(files, k, lambda columns: None, words)
     if message:
         with pytest.raises(DataError, match=message):
             walop.gather(files)

@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import PathLike, nearest
-from walop_jax.io.folder import NotWrittenError, OutputFolder, output_folder
+from walop_jax.io.folder import NotWrittenError, OutputFolder, check_apart, output_folder
+from walop_jax.io.names import NIGHTS, PRODUCT
 from walop_jax.io.progress import Stage
 from walop_jax.io.text import json_text
 
@@ -252,7 +253,8 @@ class Command(Generic[T]):
 
     `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" or "table" if `output` is a single one; () if the body looks after its outputs itself. `random`: its seed
-    matters. `jax`: it computes. `elements`: it takes kinds of elements of one's own, as commands with `effects` do.
+    matters. `jax`: it computes. `outputs` are the arguments that name what is written. `elements`: it takes kinds of
+    elements of one's own, as commands with `effects` do.
     `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
     share. `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
     """
@@ -263,6 +265,7 @@ class Command(Generic[T]):
     random: bool = False
     jax: bool = True
     elements: bool = False
+    outputs: Sequence[str] = ("output",)
 
     def __post_init__(self) -> None:
         self.name = self.body.__name__
@@ -342,6 +345,7 @@ class Command(Generic[T]):
             load_elements(elements)
             job = dataclasses.replace(job, elements=elements)
         output, names = arguments.get("output"), self.writes
+        self._check_apart(arguments)
         if output is not None and isinstance(names, str):
             check_output(output, overwrite=job.overwrite)
             if names == "table":
@@ -353,6 +357,31 @@ class Command(Generic[T]):
         with output_folder(output, names, overwrite=job.overwrite) as folder:
             outcome = self.body(dataclasses.replace(job, folder=folder), **arguments)
             return outcome.save(folder) if outcome.files or outcome.saved_as else outcome
+
+    def _check_apart(self, arguments: Mapping[str, Any]) -> None:
+        """Refuse outputs that are inputs, and two outputs in one file."""
+        files = {
+            name: path for name in self.outputs if isinstance(path := arguments.get(name), str | os.PathLike)
+        }
+        read = [
+            path for name, given in arguments.items() if name not in self.outputs for path in _paths_in(given)
+        ]
+        if "output" in files and self.writes and not isinstance(self.writes, str):
+            folder = Path(files.pop("output"))
+            check_apart([folder / name for name in self.writes], read)
+            # A survey that grows keeps the nights that it had.
+            if PRODUCT in self.writes and NIGHTS not in self.writes and (folder / PRODUCT).exists():
+                check_apart([folder], [path for path in read if Path(path).is_dir()])
+        check_apart(files.values(), read)
+        same: dict[str, str] = {}
+        for name, path in files.items():
+            if (other := same.setdefault(os.path.realpath(path), name)) != name:
+                raise UsageError(f"{path} is the file of {other} as well: give each a name of its own", name)
+
+
+def _paths_in(given: Any) -> list[PathLike]:
+    """The paths that an argument consists of: one, or those in a list."""
+    return [entry for entry in several(given) if isinstance(entry, str | os.PathLike)]
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

@@ -6,10 +6,13 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed
 from walop_jax.commands.products import InstrumentLike, design_of
+
+if TYPE_CHECKING:
+    from walop_jax import Instrument
 
 
 @command(stages=("reading", "matching", "writing"), writes="table", jax=False)
@@ -26,6 +29,7 @@ def gather(
     gain: float | None = None,
     gaia: Any = None,
     words: PathLike | None = None,
+    drop_blends: bool = False,
     instrument: InstrumentLike = None,
 ) -> Outcome[Any]:
     """Make one catalogue, a row a star, of those of the cameras.
@@ -34,6 +38,12 @@ def gather(
     with a small file that names their columns. Positions of the cameras are registered, stars matched on the sky; a
     camera whose positions are shifted or rotated, or that lacks stars, is named. X and Y are made of right ascension,
     declination and the pointing, ROTATOR is that at the star. SOURCE_ID, BP_RP, TEFF and parallaxes go with the stars.
+    Words of the exposure are read from the header of the image, of the table, and the primary header; a contradiction
+    is an error. Directions of another equinox are made ICRS.
+
+    Stars flagged only as having a neighbour or as deblended are used, with a remark, unless --drop-blends is given.
+    A table of Gaia is moved to the time of the exposure by its proper motions; of several candidates position and
+    magnitude decide, and where they cannot none is taken (ID_FLAG).
 
     In Python: an astropy table.
 
@@ -41,35 +51,48 @@ def gather(
     """
     from walop_jax.data.camera_catalogues import read_camera_catalogue
     from walop_jax.data.header_words import read_words
-    from walop_jax.io.plain_tables import astropy_table, write_table
+    from walop_jax.instruments.description import shipped
+    from walop_jax.io.errors import fail
+    from walop_jax.io.plain_tables import astropy_table, not_in, write_table
     from walop_jax.model.instrument import nominal_instrument
     from walop_jax.science.gathering import gather as gathered
-    from walop_jax.science.gathering import identified, pointing_of
+    from walop_jax.science.gathering import instrument_of, pointing_of
+    from walop_jax.science.identification import identified
 
     catalogues = several(catalogues)
-    design = design_of(instrument) or nominal_instrument()
-    names = design.cameras.names
-    if len(catalogues) != len(names):
-        what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
-        raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
-    _check_order(catalogues, names)
+    asked = design_of(instrument)
+    design = asked or nominal_instrument()
+    _check_cameras(catalogues, design)
     for option, value in (("tolerance", tolerance), ("gain", gain)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise UsageError(f"{option} = {value} must be a number above 0", option)
     job.begin("reading")
     rules = None if words is None else read_words(words)
-    cameras = [read_camera_catalogue(path, columns, gain, rules) for path in catalogues]
+    cameras = [
+        read_camera_catalogue(path, columns, gain, rules, drop_blends=drop_blends) for path in catalogues
+    ]
+    stated, remarks = instrument_of(cameras, "" if asked is None else asked.name)
+    if asked is None and stated:
+        if stated not in shipped():
+            advice = "give the description of the instrument (--instrument), or correct INSTRUME"
+            raise fail(
+                f"is {stated!r}, which is not known", file=cameras[0].path, column="INSTRUME", advice=advice
+            )
+        design = nominal_instrument(stated)
+        _check_cameras(catalogues, design)
+    names = design.cameras.names
     pointing, pointing_remarks = pointing_of(cameras, {"RA": ra, "DEC": dec, "ROTATOR": rotator})
     job.begin("matching")
     gathered_stars = gathered(cameras, names, pointing, tolerance)
     if gaia is not None:
         gathered_stars = identified(gathered_stars, gaia, tolerance)
-    remarks = [*pointing_remarks, *gathered_stars.remarks]
+    remarks += [*pointing_remarks, *gathered_stars.remarks]
     job.begin("writing")
     cards = {"INSTRUME": design.name, "RA": pointing.ra, "DEC": pointing.dec, "ROTATOR": pointing.rotator}
     table = astropy_table(gathered_stars.columns, {**cards, "RADESYS": "ICRS"})
     if output is not None:
         write_table(output, table, overwrite=job.overwrite)
+        remarks += not_in(output, table)
     by_cameras = [int((gathered_stars.matched == count).sum()) for count in range(len(names) + 1)]
     moved = [
         {"camera": name, "shift_arcsec": move.shift.tolist(), "rotation_deg": move.rotation}
@@ -82,8 +105,15 @@ def gather(
     return Outcome(table, document, text, warnings=remarks, next=(apply,))
 
 
-def _check_order(catalogues: Sequence[PathLike], names: Sequence[str]) -> None:
-    """Refuse a catalogue whose file has the name of another camera, such as O1; A and 1 may mean anything."""
+def _check_cameras(catalogues: Sequence[PathLike], design: Instrument) -> None:
+    """Refuse another number of catalogues than of cameras, and a file with the name of another camera, such as O1.
+
+    Names such as A and 1 may mean anything.
+    """
+    names = design.cameras.names
+    if len(catalogues) != len(names):
+        what = f"{len(catalogues)} catalogues for the {len(names)} cameras of {design.name}"
+        raise UsageError(f"{what}: give those of {', '.join(names)}, in this order", "catalogues")
     telling = {name.upper() for name in names if len(name) > 1 and not name.isdigit()}
     for path, name in zip(catalogues, names, strict=True):
         stated = telling & set(re.split(r"[^A-Z0-9]+", Path(path).name.upper()))

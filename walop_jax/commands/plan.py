@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 
 
-@command(stages=("information", "searching"), writes=(PLAN, INSTRUMENT, PLANNED), random=True)
+@command(
+    stages=("information", "searching"),
+    writes=(PLAN, INSTRUMENT, PLANNED),
+    random=True,
+    outputs=("output", "schedule"),
+)
 def plan(
     job: Job,
     available: ObservingPlan | Product,

@@ -17,7 +17,7 @@ from walop_jax.io.run_folder import RunFolder
 SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 
 
-@command(stages=("reading", "writing"))
+@command(stages=("reading", "writing"), outputs=("output", "figure"))
 def quality(
     job: Job,
     runs: Product | Sequence[Product],

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
-@command(stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True)
+@command(
+    stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True, outputs=("output", "compress")
+)
 def refit(
     job: Job,
     data: Sets,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from walop_jax.simulation.truth import Template
 
 
-@command(stages=("following", "writing"), writes=(), random=True)
+@command(stages=("following", "writing"), writes=(), random=True, outputs=("output", "truth"))
 def simulate(
     job: Job,
     plan: ObservingPlan | PathLike | None = None,

@@ -61,13 +61,14 @@ def table_outcome(
     of the table that are not used or are replaced are named. `remade` makes another table of that, with remarks.
     """
     from walop_jax.data.user_tables import extended
-    from walop_jax.io.plain_tables import write_table
+    from walop_jax.io.plain_tables import not_in, write_table
 
     lost = held.left_behind
     extended_table = extended(table, columns, {**cards, **left_out_cards(lost)})
     extended_table, other_remarks = (extended_table, ()) if remade is None else remade(extended_table)
     if output is not None:
         write_table(output, extended_table, overwrite=job.overwrite)
+        warnings = [*warnings, *not_in(output, extended_table)]
     counts = {bit: int((columns["FLAG"][0] & bit > 0).sum()) for bit in sorted(counted)}
     remarks = table.about(columns)
     document = {

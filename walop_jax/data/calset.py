@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from walop_jax.data import checks, schema
+from walop_jax.data.celestial import ICRS, made_icrs
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.hdus import filter_columns
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
@@ -94,6 +95,8 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
             rules = schema.table_rules(name, columns, place)
             tables[name], odd = schema.read_table(hdus[name], rules, place)
             remarks += odd
+            if name == "EXPOSURES":
+                remarks += _in_icrs(tables[name], (hdus[name].header, primary), place)
         elif name not in ("FILTERS", "SOURCES"):
             raise place.fail("the extension is missing", advice="see the file format")
     return assembled(
@@ -187,6 +190,20 @@ def _header(header: Any, path: Path) -> tuple[str, Site]:
             raise place.fail(f"is {value!r}, not a number", name, "degrees (east positive) and metres")
         values.append(float(value))
     return instrument, Site(str(header.get("TELESCOP", "")).strip(), *values)
+
+
+def _in_icrs(table: dict[str, Any], headers: Iterable[Any], place: Place) -> list[str]:
+    """Put RA and DEC of the exposures into ICRS, where the first header with a reference system states another one."""
+    known = np.isfinite(table["RA"]) & np.isfinite(table["DEC"])
+    for header in headers if known.any() else ():
+        ra, dec, frame = made_icrs(
+            header, table["RA"][known], table["DEC"][known], table["MJD"][known], place
+        )
+        if frame != ICRS:
+            table["RA"][known], table["DEC"][known] = ra, dec
+            what = f"are in {frame.system if frame.system == 'GAPPT' else frame}: converted to ICRS"
+            return [] if frame.is_icrs else [place.remark(what, "RA, DEC")]
+    return []
 
 
 def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:

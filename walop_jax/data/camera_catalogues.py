@@ -7,26 +7,32 @@ of the flags. A quantity with several columns is read from the first one that th
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import re
 import typing
-from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io import fits
-from astropy.wcs import WCS
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from walop_jax.data.header_words import Words, of_header
+from walop_jax.data.camera_headers import (
+    LDAC_OBJECTS,
+    OF_EXPOSURES,
+    POINTING,
+    Headers,
+    differ,
+    is_ldac,
+    read_headers,
+)
+from walop_jax.data.celestial import frame_of, sky_of_pixels
+from walop_jax.data.header_words import Words
 from walop_jax.data.records import DataFlag
 from walop_jax.data.schema import Column
 from walop_jax.data.table_files import read_table_file
-from walop_jax.data.units import Place, convert_unit, degrees_of, unit_of
+from walop_jax.data.units import Place, convert_unit, unit_of
 from walop_jax.data.user_tables import (
     OF_STARS,
     InputTable,
@@ -36,8 +42,7 @@ from walop_jax.data.user_tables import (
     numeric_column,
     sky_positions,
 )
-from walop_jax.io.errors import DataError, PathLike, errors_naming, rows_text
-from walop_jax.io.fits_reading import open_fits
+from walop_jax.io.errors import PathLike, errors_naming, rows_text
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
 
@@ -45,10 +50,8 @@ Numbers = Float[np.ndarray, " n"]
 
 SHIPPED = ("sextractor", "photutils")
 BAD_PIXEL = int(DataFlag.BAD_PIXEL)
-POINTING = ("RA", "DEC", "ROTATOR")
-OF_EXPOSURES = ("FILTER", "MJD", "TEMP", "HA", "CHWP_ANGLE", "CHWP_IN", "CHWP_TURN")
-"""Columns, or words of a header, about the exposure: they go with its stars."""
-_LDAC, _HEADER = "LDAC_OBJECTS", "LDAC_IMHEAD"
+_OF_IMAGE = "_SKY"
+"""End of columns in the reference system of the image; others are in that of the table."""
 _FAINTEST_MAGNITUDE = 40.0
 _NEGATIVE = 5.0  # standard errors
 _UNITS: Mapping[str, str] = {
@@ -78,6 +81,7 @@ class ColumnMap:
     flag: tuple[str, ...] = ()
     level: tuple[str, ...] = ()
     bits: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    kept: Mapping[str, str] = dataclasses.field(default_factory=dict)
     magnitude: tuple[str, ...] = ()
     unit: str = "count"
 
@@ -86,9 +90,10 @@ class ColumnMap:
 class CameraCatalogue:
     """The stars of one camera: positions (deg), fluxes with errors (electrons), level of the sky, and bits of FLAG.
 
-    `flux_name` is the column of the fluxes; `sky` is None where no level is stated. `of_stars` are columns that go with
-    the stars, `of_exposure` the values that all of them share, `pointing` RA, DEC and ROTATOR as stated; `header` is
-    that of the image, empty where the file has none. Fluxes that were not measured are NaN.
+    `flux_name` is the column of the fluxes; `sky` is None where no level is stated. `blended` marks stars whose flags
+    only say that another one is near. `of_stars` are columns that go with the stars, `of_exposure` the values that all
+    of them share; `instrument` is INSTRUME as stated ("": not at all), `worded` what the words of an observatory make
+    of the headers. Fluxes that were not measured are NaN.
     """
 
     path: Path
@@ -99,10 +104,12 @@ class CameraCatalogue:
     flux_name: str
     sky: Numbers | None
     flag: Int[np.ndarray, " n"]
+    blended: Bool[np.ndarray, " n"]
     of_stars: Mapping[str, np.ndarray]
     of_exposure: Mapping[str, Any]
-    pointing: Mapping[str, Any]
-    header: Mapping[str, Any]
+    instrument: str
+    headers: Headers
+    worded: Mapping[str, Any]
     remarks: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -125,6 +132,8 @@ def read_map(source: PathLike) -> ColumnMap:
             if meaning not in (0, *DataFlag):
                 listed = ", ".join(str(int(flag)) for flag in DataFlag)
                 raise reader.fault("bits", f"{bit} = {meaning}: give a bit of FLAG ({listed}), or 0")
+        if odd := set(values.get("kept", {})) - set(values.get("bits", {})):
+            raise reader.fault("kept", f"{min(odd)} is no bit of [bits]; give its meaning there as well")
         for pair in values.get("sky", ()):
             if len(pair) > 2:
                 raise reader.fault("", f"sky = {list(pair)} must be two columns, or one of coordinates")
@@ -132,11 +141,18 @@ def read_map(source: PathLike) -> ColumnMap:
 
 
 def read_camera_catalogue(
-    path: PathLike, columns: PathLike | None = None, gain: float | None = None, words: Words | None = None
+    path: PathLike,
+    columns: PathLike | None = None,
+    gain: float | None = None,
+    words: Words | None = None,
+    *,
+    drop_blends: bool = False,
 ) -> CameraCatalogue:
     """The catalogue of a camera, by a map of columns (None: the one of those that come with the package that fits).
 
-    `words` of the header of its image are columns about the exposure and its pointing, in place of those named so.
+    `words` of its headers are columns about the exposure and its pointing, in place of those named so. Stars that are
+    flagged only as having another one near are kept unless `drop_blends`, with a remark; those without a position are
+    left out, with a remark.
 
     `gain` is in electrons per count (None: that of the column's unit, else 1, with a remark). Fluxes are in electrons
     then.
@@ -144,27 +160,29 @@ def read_camera_catalogue(
     Raises `DataError` for a file without fluxes, for magnitudes in their place, for flags whose bits the map does not
     know, and where there is neither a position on the sky nor a WCS.
     """
-    source, header = _table(Path(path))
-    place, stated = Place(source.path, ""), header
-    if words is not None:
-        stated = ChainMap(of_header(header, words, (*OF_EXPOSURES, *POINTING), source.path), header)
+    source, headers = _table(Path(path))
+    place = Place(source.path, "")
+    worded = {} if words is None else headers.worded(words, (*OF_EXPOSURES, *POINTING))
     maps = [read_map(columns)] if columns is not None else [read_map(name) for name in SHIPPED]
     column_map = next((candidate for candidate in maps if _pair(source, candidate.flux)), None)
     if column_map is None:
         raise _no_flux(source, maps, place)
     flux, error, *sky = _fluxes(source, column_map, gain, place)
-    ra, dec = _positions(source, column_map, header, place)
-    flag = _flags(source, column_map, place)
+    of_exposure = {name: _of_all(source, headers, worded, name, place) for name in OF_EXPOSURES}
+    mjd = time_of(of_exposure)
+    ra, dec = _positions(source, column_map, headers, mjd, place)
+    flag, blended = _flags(source, column_map, place, drop_blends=drop_blends)
     bad = ~(np.isfinite(flux) & np.isfinite(error) & (error > 0))
     of_stars = {name: column_of_stars(source, name) for name in OF_STARS if name in source.names}
-    of_exposure = {name: _of_all(source, stated, name, place) for name in OF_EXPOSURES}
     if bad.any():
         what = "fluxes are not finite, or have no error above 0: not used"
         source.remarks.append(f"{int(bad.sum())} of {len(bad)} {what}")
     if low := int(np.sum(flux < -_NEGATIVE * error)):
         source.remarks.append(f"{low} of {len(bad)} fluxes are below 0 by more than {_NEGATIVE:g} errors")
-    rows = np.sort(np.unique(np.stack([ra, dec, flux, error]), axis=1, return_index=True)[1])
-    if copies := len(ra) - len(rows):
+    located = np.flatnonzero(np.isfinite(ra) & np.isfinite(dec))
+    numbers = np.stack([ra, dec, flux, error])[:, located]
+    rows = located[np.sort(np.unique(numbers, axis=1, return_index=True)[1])]
+    if copies := len(located) - len(rows):
         source.remarks.append(f"{copies} of {len(ra)} rows are copies of another row: left out")
     return CameraCatalogue(
         path=source.path,
@@ -175,34 +193,31 @@ def read_camera_catalogue(
         flux_name=_pair(source, column_map.flux)[0],
         sky=sky[0][rows] if sky else None,
         flag=np.where(bad, flag | BAD_PIXEL, flag)[rows],
+        blended=blended[rows],
         of_stars={name: values[rows] for name, values in of_stars.items()},
         of_exposure={name: value for name, value in of_exposure.items() if value is not None},
-        pointing={name: stated.get(name) for name in POINTING},
-        header=header,
+        instrument=str(_of_all(source, headers, worded, "INSTRUME", place) or ""),
+        headers=headers,
+        worded=worded,
         remarks=(*source.remarks, *source.hints({"TEFF", "SOURCE_ID", "N_FLAG"})),
     )
 
 
-def _table(path: Path) -> tuple[InputTable, Any]:
-    """The table of a file, and the header of the image that it was made from, or of the table."""
-    header: Any = {}
+def time_of(of_exposure: Mapping[str, Any]) -> float:
+    """The MJD of an exposure; NaN where it is not stated."""
     try:
-        with open_fits(path) as opened:
-            names = [hdu.name for hdu in opened.hdus]
-            if _HEADER in names:
-                cards = np.asarray(opened.hdus[names.index(_HEADER)].data[0][0]).astype(str).ravel()
-                header = fits.Header.fromstring("".join(card.ljust(80) for card in cards))
-            elif len(opened.hdus) > 1:
-                header = dict(opened.hdus[1].header)
-            if _LDAC in names:
-                path = Path(f"{path}[{_LDAC}]")
-    except DataError:
-        if path.suffix.lower() in (".fits", ".fit", ".ldac"):
-            raise
-    table_path, table, how = read_table_file(path, ())
+        return float(of_exposure.get("MJD") or np.nan)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def _table(path: Path) -> tuple[InputTable, Headers]:
+    """The table of a file, and its headers."""
+    chosen = Path(f"{path}[{LDAC_OBJECTS}]") if is_ldac(path) else path
+    table_path, table, how = read_table_file(chosen, ())
     read = in_memory(table, str(table_path))
     read.remarks.extend(how)
-    return read, header or {str(key).upper(): value for key, value in read.table.meta.items()}
+    return read, read_headers(path, read.table.meta)
 
 
 def _pair(source: InputTable, pairs: Sequence[Sequence[str]]) -> Sequence[str]:
@@ -292,9 +307,12 @@ def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
 
 
 def _positions(
-    source: InputTable, column_map: ColumnMap, header: Mapping[str, Any], place: Place
+    source: InputTable, column_map: ColumnMap, headers: Headers, mjd: float, place: Place
 ) -> tuple[Numbers, Numbers]:
-    """Right ascension and declination (deg): from the sky, or from pixels by the WCS of the header."""
+    """Right ascension and declination (deg, ICRS), NaN where they are not known.
+
+    From the sky, in the reference system of the columns or of the header, or from pixels by the WCS of the header.
+    """
     names = _pair(source, (*column_map.sky, ("RA", "DEC")))
     pixels = _pair(source, column_map.pixel)
     if len(names) == 1:
@@ -303,35 +321,51 @@ def _positions(
             raise place.fail("holds no coordinates of astropy", names[0], "name two columns, in degrees")
         ra, dec = (np.asarray(angle.deg, float) for angle in (directions.icrs.ra, directions.icrs.dec))
     elif names:
-        ra, dec = sky_positions(source, [_plain(name)[0] for name in names])
-    elif pixels and "CRVAL1" in header:
-        plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header)
+        columns = [_plain(name)[0] for name in names]
+        of_image = all(name.endswith(_OF_IMAGE) for name in columns)
+        ra, dec = sky_positions(source, columns, headers.frame(of_image, mjd))
+    elif pixels and "CRVAL1" in headers.wcs:
         x, y = (_plain_numbers(source, name, place) for name in pixels)
-        ra, dec = plane.celestial.all_pix2world(x, y, column_map.first_pixel)
-        ra, dec = np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
+        ra, dec = sky_of_pixels(headers.wcs, x, y, column_map.first_pixel, place, mjd)
+        frame = frame_of(headers.wcs, place, mjd)
+        if not frame.is_icrs:
+            source.remarks.append(f"the WCS of the header is in {frame}: converted to ICRS")
     else:
         expected = column_map.sky[0] if column_map.sky else ("RA", "DEC")
         what = f"has neither {' and '.join(expected)} nor pixels with the WCS of their image"
         advice = "write these, or a catalogue with the header (FITS_LDAC); other names go into a TOML file (--columns)"
         raise place.fail(f"{what}; it has {some(list(source.names), 8)}", "", advice)
     unknown = ~(np.isfinite(ra) & np.isfinite(dec))
-    place.refuse(unknown, "is not finite", ", ".join(names or pixels), "remove these rows")
+    listed = ", ".join(names or pixels)
+    if unknown.all():
+        raise place.fail("is finite in no row", listed, "give the positions of the stars")
+    if unknown.any():
+        what = f"{listed} is not finite in {rows_text(np.flatnonzero(unknown))}"
+        source.remarks.append(f"{what}: these stars are left out")
     return ra, dec
 
 
-def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.ndarray, " n"]:
-    """Bits of FLAG."""
+def _flags(
+    source: InputTable, column_map: ColumnMap, place: Place, *, drop_blends: bool
+) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Bits of FLAG, and the stars whose bits are `kept`; with `drop_blends` these are in FLAG as well."""
     name = next((name.upper() for name in column_map.flag if name.upper() in source.names), None)
     flag, rule = np.zeros(source.rows, np.int64), Column("int", missing=0, true=BAD_PIXEL)
     if name is None:
         source.remarks.append("no flags of the stars: blends and saturated ones are not known")
-        return flag
+        return flag, flag > 0
     values = undefined = numeric_column(source, name, rule)
     if source.column(name).dtype.kind == "b":
         source.remarks.append(f"{name} holds truth values: true is taken as a bad pixel")
-        return values
+        return values, np.zeros(source.rows, bool)
+    blended, about = np.zeros(source.rows, bool), []
     for bit, meaning in column_map.bits.items():
-        flag |= np.where(values & int(bit) > 0, meaning, 0)
+        there = values & int(bit) > 0
+        if bit in column_map.kept and there.any():
+            about.append(f"{int(there.sum())} {column_map.kept[bit]} (bit {bit})")
+            blended |= there
+        if bit not in column_map.kept or drop_blends:
+            flag |= np.where(there, meaning, 0)
         undefined = undefined & ~int(bit)
     odd = np.flatnonzero((undefined != 0) | (values < 0))
     if odd.size:
@@ -340,40 +374,27 @@ def _flags(source: InputTable, column_map: ColumnMap, place: Place) -> Int[np.nd
         raise place.fail(what, name, advice)
     if empty := int(empty_cells(source, name, rule).sum()):
         source.remarks.append(f"{name} is empty in {empty} rows: taken as good")
-    return flag
+    if about:
+        what = "left out" if drop_blends else "used, and marked in BLENDED; --drop-blends leaves them out"
+        source.remarks.append(f"{name}: of {len(flag)} stars {' and '.join(about)}: {what}")
+    return flag, blended
 
 
-def _of_all(source: InputTable, header: Mapping[str, Any], name: str, place: Place) -> Any:
-    """The value of a column, or of a word of the header, of the exposure; None: none. Refuses several values."""
+def _of_all(source: InputTable, headers: Headers, worded: Mapping[str, Any], name: str, place: Place) -> Any:
+    """The value of a column, or of a word of the headers, of the exposure; None: none.
+
+    Raises `DataError` for several values in a column, and for headers that contradict it or each other.
+    """
+    value = worded[name] if name in worded else headers.value(name)
+    value = value.strip() if isinstance(value, str) else value
     if name not in source.names:
-        value = header.get(name)
-        return value.strip() if isinstance(value, str) else value
+        return value
     values = np.unique(np.ma.compressed(np.ma.asarray(source.column(name))))
     if len(values) > 1:
         raise place.fail("is not the same in all rows", name, "give the catalogue of one exposure")
-    return values[0] if len(values) else None
-
-
-def angle_of(catalogue: CameraCatalogue, name: str) -> float | None:
-    """An angle of the pointing (deg): a number, or a text in hours (RA) or degrees; None: none is stated."""
-    value = catalogue.pointing[name]
-    if value is None or isinstance(value, bool) or value == "":
-        return None
-    for angle in (float, lambda text: float(degrees_of(str(text), "hourangle" if name == "RA" else "deg"))):
-        with contextlib.suppress(ValueError):
-            return angle(value)
-    advice = f"give --{name.lower()} (deg) to walop-jax gather, or the word that holds it (--words)"
-    raise Place(catalogue.path, "header").fail(f"{value!r} is no angle", name, advice)
-
-
-def centre_of(header: Mapping[str, Any]) -> dict[str, float] | None:
-    """RA and DEC of the centre of an image and the position angle of its axis x (deg), by its WCS; None: no WCS."""
-    if "CRVAL1" not in header or "NAXIS1" not in header or not header.get("CTYPE1", "").startswith("RA"):
-        return None
-    plane = WCS(fits.Header(header) if not isinstance(header, fits.Header) else header).celestial
-    middle = [0.5 * (float(header[f"NAXIS{k}"]) + 1.0) for k in (1, 2)]
-    centre_pixel: Any = plane.pixel_to_world(middle[0] - 1.0, middle[1] - 1.0)
-    beside: Any = plane.pixel_to_world(middle[0], middle[1] - 1.0)
-    centre = centre_pixel.icrs
-    angle = float(centre.position_angle(beside.icrs).deg)
-    return {"RA": float(centre.ra.deg), "DEC": float(centre.dec.deg), "ROTATOR": angle}
+    if not len(values):
+        return value
+    if value is not None and differ(name, [values[0], value]):
+        what = f"is {values[0]} in the column and {value} in the header"
+        raise place.fail(what, name, "correct the one that is wrong")
+    return values[0]

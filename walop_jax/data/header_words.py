@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from walop_jax.data.celestial import made_icrs
 from walop_jax.data.kinds import KINDS
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, table_of, table_rules
 from walop_jax.data.table_files import read_table_file
@@ -121,6 +122,9 @@ def exposures_table(
     if not records:
         raise fail("no exposures in these files", advice="name FITS files, a JSON file or a table")
     rows = [_row(record, words.columns, file) for file, record in records]
+    converted = [
+        _made_icrs(row, record, words, file) for row, (file, record) in zip(rows, records, strict=True)
+    ]
     there = set().union(*rows, ("EXPOSURE",))
     through = [row for row in rows if "CLP_IN" not in row and str(row.get("KIND")).lower() == "clp"]
     for row in through:
@@ -128,6 +132,8 @@ def exposures_table(
     table = columns_of(rows, ", ".join(dict.fromkeys(file for file, _ in records)))
     absent = [name for name in EXPOSURES if name not in there and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    for frame in dict.fromkeys(filter(None, converted)):
+        remarks.append(f"RA and DEC of {converted.count(frame)} exposures are in {frame}: converted to ICRS")
     if through:
         remarks.append(f"CLP_IN is not stated in {len(through)} exposures of KIND clp: taken as true")
     if unknown := int(np.sum(table["CLP_IN"] & np.isnan(table.get("CLP_ANGLE", np.array(np.nan))))):
@@ -175,6 +181,7 @@ def of_header(
             word = needed[name] = words.columns[name]
             waiting += _operands(word.expression)
     row = _row(_plain(header), needed, str(file))
+    _made_icrs(row, header, words, str(file))
     return {name: value for name, value in row.items() if name in names}
 
 
@@ -275,6 +282,16 @@ def _row(record: Mapping[str, Any], words: Mapping[str, Word], file: str) -> dic
             operands = {**converted, "x": converted[name]}
             converted[name] = _evaluated(waiting.pop(name), operands, name, place)
     return converted
+
+
+def _made_icrs(row: dict[str, Any], record: Mapping[str, Any], words: Words, file: str) -> str:
+    """Put RA and DEC of a row into ICRS, where they are words of a record in another system; its name, "" for ICRS."""
+    if not {"RA", "DEC"} <= set(row) or any(words.columns[name].value is not None for name in ("RA", "DEC")):
+        return ""
+    place = Place(file, "")
+    ra, dec, frame = made_icrs(record, row["RA"], row["DEC"], row.get("MJD", math.nan), place)
+    row |= {"RA": float(ra), "DEC": float(dec)}
+    return "" if frame.is_icrs else frame.system if frame.system == "GAPPT" else str(frame)
 
 
 def _value(value: Any, name: str, rule: Column, word: Word, place: Place) -> Any:

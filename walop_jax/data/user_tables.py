@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from walop_jax.data.celestial import Frame, frame_of_names, made_icrs
 from walop_jax.data.schema import MISSING, Column, distinct, plain_column, values_of
 from walop_jax.data.table_files import read_table_file, table_of_hdu
 from walop_jax.data.units import Place, check_units, degrees_of, is_sexagesimal, partner_of, unit_of
 from walop_jax.io.errors import PathLike, fail
 from walop_jax.io.fits_reading import one_line
+from walop_jax.io.plain_tables import numbered
 from walop_jax.io.text import in_ascii, some
 
 _LISTED = 12  # columns, in a message
@@ -183,9 +185,12 @@ _FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fift
 
 
 def sky_positions(
-    source: InputTable, names: Sequence[str] = ("RA", "DEC")
+    source: InputTable, names: Sequence[str] = ("RA", "DEC"), frame: Frame | None = None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Right ascensions and declinations (deg) of a table; as sexagesimal texts they are in hours and degrees.
+    """Right ascensions and declinations (deg, ICRS) of a table; as sexagesimal texts they are in hours and degrees.
+
+    They are in the reference system that their names state (…_J2000, …_B1950), else in `frame` (None: that of the
+    header of the table), and are converted, with a remark.
 
     Empty cells are NaN. Raises `DataError` for values that are no angles or out of range, and for right ascensions
     without a unit that are hours: none beyond 24, of a field that would be a fifteenth as wide as high.
@@ -197,7 +202,7 @@ def sky_positions(
     column, stated = source.column(names[0]), ra[np.isfinite(ra)]
     with_unit = unit_of(column) or column.dtype.kind not in "fiu"
     if with_unit or not stated.size or np.abs(stated - 12.0).max() > 12.0:
-        return ra, dec
+        return _in_icrs(source, names, frame, ra, dec)
     from_first = np.mod(stated - stated.min() + 12.0, 24.0)  # a field about 0 h is no wider than others
     width = np.std(from_first) * np.cos(np.deg2rad(np.nanmedian(dec)))
     if len(ra) < _FEWEST_STARS:
@@ -206,6 +211,23 @@ def sky_positions(
     elif width < _FLAT * np.nanstd(dec):
         what = f"lies between {stated.min():.4g} and {stated.max():.4g}, has no unit, and looks like hours"
         raise place.fail(what, names[0], "degrees are needed: multiply by 15, or give the unit hourangle")
+    return _in_icrs(source, names, frame, ra, dec)
+
+
+def _in_icrs(
+    source: InputTable, names: Sequence[str], frame: Frame | None, ra: np.ndarray, dec: np.ndarray
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    frame = frame_of_names(names) or frame
+    if frame is None:
+        header, mjd = source.table.meta, np.array(np.nan)
+        if "MJD" in source.names and str(header.get("RADESYS", "")).strip().upper() == "GAPPT":
+            mjd = numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
+        ra, dec, frame = made_icrs(header, ra, dec, mjd, Place(source.path, "header"))
+    else:
+        ra, dec = frame.to_icrs(ra, dec)
+    remark = f"{', '.join(names)} are in {frame}: converted to ICRS"
+    if not frame.is_icrs and remark not in source.remarks:
+        source.remarks.append(remark)
     return ra, dec
 
 
@@ -290,8 +312,9 @@ def spellings(name: str, width: int, cameras: Sequence[str]) -> list[list[str]]:
     head, _, tail = name.partition("_")
     end = f"_{tail}" if tail else ""
     of_camera = end if head == "N" else f"_{name}"
-    numbered = [f"{head}{k}{end}" for k in range(width)], [f"{name}{k}" for k in range(width)]
-    return [[name], numbered[0], [f"{camera.upper()}{of_camera}" for camera in cameras], numbered[1]]
+    by_camera = [f"{camera.upper()}{of_camera}" for camera in cameras]
+    ends = [f"{name}{k}" for k in range(width)]
+    return [[name], numbered(name, width), by_camera, ends]
 
 
 def empty_cells(source: InputTable, name: str, rule: Column) -> Bool[np.ndarray, " n"]:

@@ -11,8 +11,9 @@ import contextlib
 import dataclasses
 import datetime
 import os
+import re
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from walop_jax.io import atomic
@@ -44,6 +45,24 @@ def check_folder(path: PathLike, names: Sequence[str] = (), *, overwrite: bool =
     if not os.access(folder, os.W_OK | os.X_OK):
         raise fail("the folder is read-only", file=path, advice="choose another folder")
     return Path(os.path.realpath(folder))
+
+
+def check_apart(written: Iterable[PathLike], read: Iterable[PathLike]) -> None:
+    """Refuse files to be written that are files to be read, by whatever name or link; with --overwrite they were lost.
+
+    `read` may name a table in a file, as in STARS.fits[OBJECTS]. Raises `DataError`.
+    """
+    inputs = [
+        Path(re.sub(r"\[[^\[\]]+\]$", "", str(path)) if not os.path.exists(path) else path) for path in read
+    ]
+    for target in written:
+        for path in inputs:
+            with contextlib.suppress(OSError):
+                if os.path.samefile(target, path):
+                    what = f"is the output and an input{'' if str(path) == str(target) else f', {path}'}"
+                    raise fail(
+                        what, file=target, advice="give the output another name: the input would be lost"
+                    )
 
 
 class NotWrittenError(DataError):

@@ -17,6 +17,7 @@ from astropy.table import Table, vstack
 
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import PathLike, fail
+from walop_jax.io.text import some
 
 FORMATS = {
     ".fits": "fits",
@@ -92,8 +93,42 @@ def stacked(first: Any, second: Any) -> Any:
     return vstack([first, second], metadata_conflicts="silent")
 
 
+def numbered(name: str, width: int) -> list[str]:
+    """Names of columns side by side in place of one with so many numbers in a row: N0 …, N0_ERR …; of others SKY0 …"""
+    head, _, tail = name.partition("_")
+    if head == "N":
+        return [f"{head}{k}{'_' + tail if tail else ''}" for k in range(width)]
+    return [f"{name}{k}" for k in range(width)]
+
+
+def _side_by_side(table: Any) -> Any:
+    """The table with a column for each number of a row, as texts of numbers need it; without its header."""
+    flat = Table()
+    for name in table.colnames:
+        column = table[name]
+        if len(shape := column.shape[1:]) == 0:
+            flat[name] = column
+            continue
+        values = column.reshape(len(column), -1)
+        for k, single in enumerate(numbered(name, int(np.prod(shape)))):
+            flat[single] = values[:, k]
+    return flat
+
+
+def not_in(path: PathLike, table: Table) -> list[str]:
+    """A sentence on the words of a table's header that the format of a file cannot hold."""
+    words = [
+        str(key) for key in (table.meta or {}) if str(key).upper() not in ("REMARK", "COMMENT", "HISTORY")
+    ]
+    if table_format(path) != "ascii.csv" or not words:
+        return []
+    return [f"CSV has no header: {some(words, 8)} are not in {path}; .ecsv and .fits keep them"]
+
+
 def write_table(path: PathLike, table: Table, *, overwrite: bool = False) -> None:
     """Write an astropy table in the format of the name; whole or not at all.
+
+    In CSV, which has neither a header nor several numbers in a cell, the latter stand side by side (`numbered`).
 
     Raises `DataError` as `atomic_path` does, for an unknown extension, and for columns that the format cannot hold.
     """
@@ -104,7 +139,8 @@ def write_table(path: PathLike, table: Table, *, overwrite: bool = False) -> Non
             if kind == "votable":
                 _as_votable(table).to_xml(str(temporary))
             else:
-                table.write(temporary, format=kind, overwrite=True)
+                flat = _side_by_side(table) if kind == "ascii.csv" else table
+                flat.write(temporary, format=kind, overwrite=True)
         except ImportError as error:
             what = f"needs {error.name or 'a library'}, which is not installed"
             raise fail(what, file=path, advice="pip install 'walop-jax[parquet]', or write .fits") from error

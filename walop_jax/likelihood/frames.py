@@ -85,6 +85,7 @@ def _terms(
     open_: Bool[Array, "e w"],
     flux_known: Bool[Array, " e"],
     together: Float[Array, "k k"] | None,
+    floor: Float[Array, ""],
 ) -> tuple[CellSums, Int[Array, " w"]]:
     """The terms of the pixels of a piece of an image row, each a cell by itself, and those with impossible errors."""
 
@@ -96,8 +97,9 @@ def _terms(
     finite = jnp.isfinite(counts) & jnp.isfinite(sigma)
     wrong = open_ & jnp.any(jnp.isfinite(sigma) & (sigma <= 0), axis=0)
     used = open_ & ~wrong & jnp.all(finite & (counts >= -NEGATIVE * sigma), axis=0)
-    weight = jnp.where(used, 1.0 / jnp.where(used, sigma, 1.0) ** 2, 0.0)
     counts = jnp.where(used, counts, 0.0)
+    sigma = jnp.maximum(sigma, floor * counts.mean(axis=0))  # as `model.cameras.with_floor`
+    weight = jnp.where(used, 1.0 / jnp.where(used, sigma, 1.0) ** 2, 0.0)
     light = unit * weight
     power = summed(light * unit)
     flux = jnp.where(flux_known[:, None], 1.0, summed(light * counts) / jnp.where(power > 0, power, 1.0))
@@ -122,6 +124,7 @@ def _strip_sums(
     side: Float[Array, " c"],
     flux_known: Bool[Array, " e"],
     together: Float[Array, "k k"] | None,
+    floor: Float[Array, ""],
 ) -> StripSums:
     cameras, exposures, height, width = rows.counts.shape
     cell, piece = side.size, piece_of(side.size)
@@ -134,7 +137,8 @@ def _strip_sums(
         polynomials = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
         open_ = jax.lax.dynamic_slice(rows.open, (0, row, start), (exposures, 1, piece))[:, 0]
         unit = (by_row[row] @ polynomials).reshape(cameras, exposures, piece)
-        return _terms(unit, float64(cut(rows.counts)), float64(cut(rows.sigma)), open_, flux_known, together)
+        counts, sigma = (float64(cut(values)) for values in (rows.counts, rows.sigma))
+        return _terms(unit, counts, sigma, open_, flux_known, together, floor)
 
     def one_piece(first: Int[Array, ""], start: Int[Array, ""]) -> StripSums:
         polynomials = jax.lax.dynamic_slice_in_dim(across, start, piece, axis=1)
@@ -173,8 +177,8 @@ strip_sums = compiled(_strip_sums, fuse=True)
 
 `series` are the coefficients of the counts for light of unit flux; `across` and `along` the polynomials at the columns
 and rows; `side` has as many entries as a cell has columns and rows; `known` says in which exposures the flux is one;
-`together` which cameras have a flux in common (`Cameras.together`). Columns come in whole pieces (`piece_of`), rows in
-whole cells.
+`together` which cameras have a flux in common (`Cameras.together`), `floor` the smallest error as a share of the light
+(`Cameras.floor`). Columns come in whole pieces (`piece_of`), rows in whole cells.
 """
 
 
@@ -379,7 +383,7 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
     unit = np.asarray(smooth.coefficients.unit)[..., exposures]
     series = np.swapaxes(unit.reshape(smooth.count, smooth.count, *unit.shape[1:]), 0, 1)
     fixed = jnp.asarray(likelihood.flux_known[exposures])
-    together = instrument.cameras.together
+    together, floor = instrument.cameras.together, jnp.asarray(instrument.cameras.floor)
     read = RowReader(frames, height, width)
 
     def work(number: int) -> tuple[np.ndarray, CellSums]:
@@ -388,7 +392,8 @@ def frame_sums(likelihood: Likelihood, values: Vector, every: int = 1) -> FrameS
         pixels = read(top, bottom)
         t = np.minimum((top + np.arange(height) + 0.5) * cells.size[1] - 1.0, 1.0)
         along = jnp.asarray(chebyshev.polynomials(t, smooth.count))
-        strip = strip_sums(pixels, jnp.asarray(series), across, along, jnp.zeros(cells.side), fixed, together)
+        side = jnp.zeros(cells.side)
+        strip = strip_sums(pixels, jnp.asarray(series), across, along, side, fixed, together, floor)
         if int(strip.impossible):
             frames.block(top * cells.grid.width, bottom * cells.grid.width)  # names the pixel
         cut = jax.tree.map(lambda leaf: np.asarray(leaf)[..., :columns], strip.cells)

@@ -285,7 +285,7 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
+        sigma = with_floor(block.sigma, block.counts, self._floor())
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         data = PointData(
             x=array(block.x),
@@ -299,6 +299,13 @@ class PointReader:
         )
         fields = fields_of_stars(self.calset.sources)
         return data._replace(stars=array(self._stars(data, fields))) if len(fields) else data
+
+    def _floor(self) -> float | Float[np.ndarray, "e 1"]:
+        """`Cameras.floor`, in each exposure: where points stand for pixels, it has counted for each of these."""
+        floor, compression = self.instrument.cameras.floor, self.calset.compression
+        if compression is None or floor == 0.0:
+            return floor
+        return np.where(compression.covers(self.calset.exposures), 0.0, floor)[:, None]
 
     def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
         """`Sharing.stars`: q, u of a star differ from those of its field by the same in all exposures of its point."""

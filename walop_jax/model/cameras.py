@@ -164,7 +164,10 @@ class Cameras(Component):
 
 
 def with_floor(
-    sigma: Float[np.ndarray, "p a b"], counts: Float[np.ndarray, "p a b"], floor: float, cameras: int = 2
+    sigma: Float[np.ndarray, "p a b"],
+    counts: Float[np.ndarray, "p a b"],
+    floor: float | Float[np.ndarray, "*c"],
+    cameras: int = 2,
 ) -> Float[np.ndarray, "p a b"]:
     """Standard errors of counts, none smaller than `Cameras.floor` allows; `cameras` is the axis of these."""
-    return sigma if floor == 0.0 else np.maximum(sigma, floor * counts.mean(axis=cameras, keepdims=True))
+    return sigma if not np.any(floor) else np.maximum(sigma, floor * counts.mean(axis=cameras, keepdims=True))

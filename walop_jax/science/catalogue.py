@@ -85,7 +85,10 @@ def read_catalogue(
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
-    points, cameras = field_points(source, instrument, always_in, never_in), len(instrument.cameras)
+    points, cameras = (
+        field_points(source, instrument, always_in, never_in, everywhere=False),
+        len(instrument.cameras),
+    )
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = user_tables.vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     points, teff_err = _with_colours(source, points, place)
@@ -134,7 +137,8 @@ def read_catalogue(
     )
 
 
-CARRIED = ("RA", "DEC", *user_tables.OF_STARS)  # columns that are about the stars, and go through as they are
+CARRIED = ("RA", "DEC", "BLENDED", "ID_FLAG", *user_tables.OF_STARS)
+"""Columns that are about the stars, and go through as they are."""
 
 
 def _with_colours(source: InputTable, points: FieldPoints, place: Place) -> tuple[FieldPoints, OfRows]:

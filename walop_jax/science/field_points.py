@@ -37,6 +37,8 @@ POINT_COLUMNS: Mapping[str, Column] = {
 }
 
 
+SETTINGS = tuple(name for name in POINT_COLUMNS if name not in ("X", "Y"))
+
 _ASSUMED = (
     ("TEMP", "temperature", f"{TEMPERATURE:g} Celsius"),
     ("HA", "hour_angle", "the meridian"),
@@ -64,6 +66,8 @@ def field_points(
     instrument: Instrument,
     always_in: Collection[str] = (),
     never_in: Collection[str] = (),
+    *,
+    everywhere: bool = True,
 ) -> FieldPoints:
     """The X, Y and optional settings of a table of field points of an instrument.
 
@@ -71,14 +75,22 @@ def field_points(
     angle. `<P>_TURN` (absent: 0) is by how much it turns during the exposure, about that angle. Of column prefixes,
     those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of the calibration, are in it
     only where `<P>_IN` says so. Single points outside the field are marked; if most of them lie outside, the unit must
-    be wrong.
+    be wrong. Unless a place is needed `everywhere`, points without one are marked as well, with a remark.
 
     Raises `DataError` naming file, column and row for anything that cannot be meant.
     """
     place = Place(source.path, "")
     columns = {name: numeric_column(source, name, rule) for name, rule in POINT_COLUMNS.items()}
-    check(columns, POINT_COLUMNS, place)
     x, y = columns["X"], columns["Y"]
+    lost = ~np.isfinite(x + y)
+    if lost.any() and not (everywhere or lost.all()):
+        where = rows_text(np.flatnonzero(lost))
+        source.remarks.append(
+            f"X or Y is not finite in {where}: these rows are left out (no result, FLAG 16384)"
+        )
+        x, y = (np.where(lost, 0.0, values) for values in (x, y))
+    needed = POINT_COLUMNS if everywhere or lost.all() else {n: POINT_COLUMNS[n] for n in SETTINGS}
+    check(columns, needed, place)
     moving = instrument.moving()
     missing = [prefix for prefix in moving if prefix in always_in and f"{prefix}_ANGLE" not in source.names]
     if missing:
@@ -112,7 +124,7 @@ def field_points(
             turns[prefix] = np.where(inside, np.abs(turn), 0.0)
     limit = instrument.field_limit
     outside = np.maximum(np.abs(x), np.abs(y)) > limit
-    if len(x) > _SINGLE and np.mean(outside) > 0.5:
+    if len(x) > _SINGLE and np.mean(outside[~lost]) > 0.5:
         what = (
             f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}"
         )
@@ -123,7 +135,7 @@ def field_points(
             source.remarks.append(f"{name} {what}; add the column")
     columns["HA"] = nearest_hours(columns["HA"])
     stated = (columns[name] for name in ("FILTER", "TEFF", "TEMP", "HA"))
-    return FieldPoints(x, y, Settings(*stated, positions=positions, turns=turns), outside)
+    return FieldPoints(x, y, Settings(*stated, positions=positions, turns=turns), outside | lost)
 
 
 def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:

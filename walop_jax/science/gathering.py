@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data import user_tables
-from walop_jax.data.camera_catalogues import CameraCatalogue, angle_of, centre_of
-from walop_jax.data.schema import Column
+from walop_jax.data.camera_catalogues import CameraCatalogue, time_of
+from walop_jax.data.camera_headers import APART, centre_of, differ, letters, pointing_in
+from walop_jax.data.units import Place
 from walop_jax.data.user_tables import OF_STARS
+from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import fail
 from walop_jax.sky import directions
 from walop_jax.sky.directions import FEWEST_REGISTERED, Pointing, Registration
@@ -28,9 +28,9 @@ BLEND = 8  # bit of N_FLAG
 FEWEST = 0.2  # of the stars of a camera must be those of the others
 MISSING = 0.2  # of the stars that all others see, from which on a camera is remarked on
 SAME_FLUXES = 0.5  # of the stars of two cameras: one is a copy of the other
-APART = {"MJD": 0.01, "TEMP": 0.5, "HA": 0.05}
-"""Largest differences between catalogues of one exposure; other values are the same."""
 DIGITS = 1e-3  # to which cameras agree on a number of a star
+BESIDE_WCS = (5.0 / 3600.0, 0.1)
+"""Distance and angle (deg) from which on a pointing contradicts the WCS of an image."""
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
 Columns = dict[str, tuple[np.ndarray, str, str]]  # values, unit and description of columns by name
 Catalogues = Sequence[CameraCatalogue]
@@ -56,29 +56,96 @@ class Gathered:
 
 
 def pointing_of(catalogues: Catalogues, given: dict[str, float | None]) -> tuple[Pointing, list[str]]:
-    """The pointing, as given, of the header, or of the WCS of an image, with a remark on the last.
+    """The pointing, as given, of the headers, or of the WCS of an image, with remarks.
 
-    Raises `DataError` where it is nowhere, and for angles (deg) that cannot be meant.
+    One that contradicts the WCS beside it is remarked on. Raises `DataError` where it is nowhere, for headers that
+    contradict each other, and for angles (deg) that cannot be meant.
     """
     first, remarks = catalogues[0], []
-    numbers = {name: angle_of(first, name) if value is None else value for name, value in given.items()}
+    needed = [name for name, value in given.items() if value is None]
+    stated = dict[str, list[tuple[Any, float]]]()
+    for camera in catalogues:
+        mjd = time_of(camera.of_exposure)
+        values, about = pointing_in(camera.headers, camera.worded, needed, mjd)
+        for name, value in values.items():
+            stated.setdefault(name, []).append((camera.path, value))
+        remarks += [f"{camera.path}: {text}" for text in about if camera is first]
+    for name, of_cameras in stated.items():
+        if differ(name, [value for _, value in of_cameras]):
+            listed = _listed([(path, f"{value:.6g}") for path, value in of_cameras])
+            advice = f"give --{name.lower()} (deg), or correct the word that is wrong"
+            raise fail(f"{name} is {listed} in the headers of one exposure", advice=advice)
+    numbers = given | {name: of_cameras[0][1] for name, of_cameras in stated.items()}
     missing = [name for name, value in numbers.items() if value is None]
-    if missing:
-        from_wcs = centre_of(first.header)
-        if from_wcs is None:
-            what = f"has no {' and no '.join(missing)} in its header, and no WCS of an image"
-            advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
-            raise fail(what, file=first.path, advice=advice)
-        numbers |= {name: from_wcs[name] for name in missing}
-        stated = ", ".join(f"{name} {from_wcs[name]:.6g}" for name in missing)
-        remarks.append(f"{first.path}: {stated} deg from the WCS: centre of the image, and its axis x as +X")
+    centres = ((c.path, c.headers.wcs, time_of(c.of_exposure)) for c in catalogues)
+    from_wcs = ((path, centre_of(wcs, Place(path, "header"), mjd)) for path, wcs, mjd in centres)
+    path, centre = next(((path, found) for path, found in from_wcs if found), (first.path, None))
+    if missing and centre is None:
+        what = f"has no {' and no '.join(missing)} in its headers, and no WCS of an image"
+        advice = f"give {' '.join(f'--{name.lower()} …' for name in missing)} (deg) to walop-jax gather"
+        raise fail(what, file=first.path, advice=advice)
+    if missing and centre is not None:
+        numbers |= {name: centre[name] for name in missing}
+        listed = ", ".join(f"{name} {centre[name]:.6g}" for name in missing)
+        remarks.append(f"{path}: {listed} deg from the WCS: centre of the image, and its axis x as +X")
     values = {name: float(value) for name, value in numbers.items() if value is not None}
     for name, value in values.items():
         limit = 90.0 if name == "DEC" else 360.0
         if not abs(value) <= limit:
             what = f"{name} of the field centre is {value:g} deg"
             raise fail(what, file=first.path, advice=f"at most {limit:g} deg")
+    if centre is not None:
+        remarks += [f"{path}: {text}" for text in _beside_wcs(values, centre)]
     return Pointing(*values.values()), remarks
+
+
+def _beside_wcs(values: dict[str, float], centre: dict[str, float]) -> list[str]:
+    """Sentences on a pointing that is not that of the WCS of the image."""
+    sentences = []
+    away = float(directions.separation(values["RA"], values["DEC"], centre["RA"], centre["DEC"]))
+    if away > BESIDE_WCS[0]:
+        size = f"{60.0 * away:.3g} arcmin" if away > 1.0 / 60.0 else f"{3600.0 * away:.2g} arcsec"
+        both = (f"RA {at['RA']:.6g}, DEC {at['DEC']:.6g}" for at in (values, centre))
+        what = "{} deg as stated, {} deg in the centre of the image by its WCS".format(*both)
+        sentences.append(
+            f"{what}: {size} apart; which one is wrong? --ra and --dec give the centre of the field"
+        )
+    turned = (values["ROTATOR"] - centre["ROTATOR"] + 180.0) % 360.0 - 180.0
+    if abs(turned) > BESIDE_WCS[1]:
+        what = f"ROTATOR {values['ROTATOR']:.6g} deg as stated, axis x of the image at {centre['ROTATOR']:.6g} deg"
+        advice = "right where x is not the direction of +X; else check the zero and the sign of ROTATOR (--rotator)"
+        sentences.append(f"{what} by its WCS: {abs(turned):.3g} deg apart; {advice}")
+    return sentences
+
+
+def _listed(stated: Sequence[tuple[Any, str]]) -> str:
+    """Values that differ, each with the first file that states it."""
+    files = dict[str, Any]()
+    for path, value in stated:
+        files.setdefault(value, path)
+    return " and ".join(f"{value} ({path})" for value, path in files.items())
+
+
+def instrument_of(catalogues: Catalogues, asked: str) -> tuple[str, list[str]]:
+    """The instrument that the catalogues state ("": none), and a remark where it is none that is known.
+
+    `asked` is the name of the instrument that is asked for ("": none). Raises `DataError` for cameras of different
+    instruments, and for another one than that asked for.
+    """
+    stated = [(camera.path, camera.instrument) for camera in catalogues if camera.instrument]
+    if differ("INSTRUME", [name for _, name in stated]):
+        advice = "give the catalogues of one instrument, or correct the word"
+        raise fail(f"INSTRUME is {_listed(stated)} in catalogues of one exposure", advice=advice)
+    if not stated:
+        return "", []
+    path, name = stated[0]
+    known = next((shipped_name for shipped_name in shipped() if letters(shipped_name) == letters(name)), "")
+    if not asked or letters(name) == letters(asked):
+        return known or name, []
+    if known:
+        advice = f"give --instrument {known} to walop-jax gather (to apply: a calibration of it), or correct INSTRUME"
+        raise fail(f"is {name}, {asked} is asked for", file=path, column="INSTRUME", advice=advice)
+    return asked, [f"{path}: INSTRUME is {name!r}, which is no instrument that is known: taken as {asked}"]
 
 
 def gather(
@@ -120,43 +187,6 @@ def gather(
         remarks.append(f"{doubtful} stars {what}")
     columns, about = _columns(catalogues, pointing, index, ambiguous, place)
     return Gathered(columns, pointing, moves, detected.sum(axis=1), (*remarks, *about))
-
-
-def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
-    """The same with the columns of a table of known stars (RA, DEC and any of `OF_STARS`) that are matched with them.
-
-    `table` is a path, an astropy table, or columns by name. Positions are registered first, as between cameras.
-    """
-    read = isinstance(table, str | os.PathLike)
-    source = user_tables.read_input_table(table, ("RA", "DEC")) if read else user_tables.in_memory(table)
-    if not set(OF_STARS) & set(source.names):
-        raise fail(f"has none of {', '.join(OF_STARS)}", file=source.path, advice="name its columns so")
-    ra, dec = user_tables.sky_positions(source)
-    near = directions.separation(made.pointing.ra, made.pointing.dec, ra, dec) < FARTHEST
-    reference = np.stack(made.pointing.field_of(ra[near], dec[near]), axis=1)
-    place = np.stack([made.columns[name][0] for name in "XY"], axis=1)
-    bright = np.nan_to_num(np.nansum(made.columns["N"][0], axis=1))
-    magnitude = user_tables.numeric_column(source, "PHOT_G_MEAN_MAG", Column("float", missing=np.nan))[near]
-    move = directions.registered(place, reference, bright, np.nan_to_num(-magnitude, nan=-np.inf), tolerance)
-    if not move.pairs and (not len(reference) or min(len(place), len(reference)) >= FEWEST_REGISTERED):
-        what = f"has no stars in common with the cameras within {directions.REACH / 60.0:g} arcmin"
-        raise fail(what, file=source.path, advice="is it of this field? RA and DEC are in degrees")
-    _, stars, rows = directions.mutual(move.apply(place), reference, tolerance)
-    columns = dict(made.columns)
-    for name, (unit, about) in OF_STARS.items():
-        if name in source.names:
-            texts = name == "SOURCE_ID"
-            values = np.full(len(place), "" if texts else np.nan, object if texts else float)
-            values[stars] = user_tables.column_of_stars(source, name)[near][rows]
-            columns[name] = (_whole(values) if texts else values, unit, about)
-    remarks = [f"{len(stars)} of {len(place)} stars are in {source.path}"]
-    if replaced := [name for name in OF_STARS if name in source.names and name in made.columns]:
-        remarks.append(f"{', '.join(replaced)} of the cameras: replaced by those of {source.path}")
-    remarks += [f"{source.path}: {hint}" for hint in source.hints({"SOURCE_ID", "TEFF"})]
-    if np.hypot(*move.shift) > 0.5 * tolerance:
-        shift = f"{move.shift[0]:+.1f} and {move.shift[1]:+.1f} arcsec along X and Y"
-        remarks.append(f"all cameras are shifted by {shift} against {source.path}: is their WCS right?")
-    return dataclasses.replace(made, columns=columns, remarks=(*made.remarks, *remarks))
 
 
 def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, "n 2"]:
@@ -269,6 +299,9 @@ def _columns(
         "N_ERR": (of_cameras([camera.error for camera in catalogues], np.nan), "", "standard errors of N"),
         "N_FLAG": (flag.astype(np.int32), "", "bits of each camera, 0 is good"),
     }
+    if any(camera.blended.any() for camera in catalogues):
+        near = of_cameras([camera.blended for camera in catalogues], False).any(axis=1)
+        columns["BLENDED"] = (np.asarray(near), "", "another star is near, by the flags of a camera")
     if levels := [camera.sky for camera in catalogues if camera.sky is not None]:
         if len(levels) < len(catalogues):
             what = "only some cameras have a level of the sky"
@@ -281,28 +314,19 @@ def _columns(
         texts = name == "SOURCE_ID"
         empty = "" if texts else np.nan
         columns_of = [camera.of_stars.get(name, np.full(len(camera), empty)) for camera in catalogues]
-        values, differ = _agreed(of_cameras(columns_of, empty), texts)
-        if count := int(differ.sum()):
+        values, apart = _agreed(of_cameras(columns_of, empty), texts)
+        if count := int(apart.sum()):
             remarks.append(f"{name} is not the same in all cameras for {count} stars: taken as unknown")
-        columns[name] = (_whole(values) if texts else values, unit, about)
+        columns[name] = (whole(values) if texts else values, unit, about)
     for name in sorted({name for camera in catalogues for name in camera.of_exposure}):
-        stated = [camera.of_exposure.get(name, "not stated") for camera in catalogues]
-        if _differ(name, stated):
-            listed = " and ".join(sorted(set(map(str, stated))))
+        stated = [(camera.path, camera.of_exposure.get(name, "not stated")) for camera in catalogues]
+        apart = differ(name, [value for _, value in stated if name not in APART or value != "not stated"])
+        if apart:
+            listed = _listed([(path, str(value)) for path, value in stated])
             raise fail(f"{name} is {listed} in catalogues of one exposure", advice="correct it")
         value = next(camera.of_exposure[name] for camera in catalogues if name in camera.of_exposure)
         columns[name] = (np.full(len(ra), value), "", "of the exposure")
     return columns, remarks
-
-
-def _differ(name: str, stated: Sequence[Any]) -> bool:
-    """True where catalogues of one exposure state different values; cameras have their own clocks and sensors."""
-    if name not in APART:
-        return len(set(map(str, stated))) > 1
-    try:
-        return float(np.ptp([float(value) for value in stated if value != "not stated"])) > APART[name]
-    except ValueError:
-        return True
 
 
 def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarray, " s"]]:
@@ -318,7 +342,7 @@ def _agreed(values: np.ndarray, texts: bool) -> tuple[np.ndarray, Bool[np.ndarra
     return np.where(differ, "" if texts else np.nan, value), differ
 
 
-def _whole(values: np.ndarray) -> np.ndarray:
+def whole(values: np.ndarray) -> np.ndarray:
     """Identifiers as integers where all are such, -1 for unknown ones."""
     texts = np.where(values == "", "-1", values.astype(str))
     integers = all(text.lstrip("-").isdigit() for text in texts.tolist())
