@@ -52,7 +52,7 @@ def limits(
     from walop_jax.fit.refit import refit
     from walop_jax.reports.diagnosis_figures import protection_figure, separation_figure
     from walop_jax.simulation.observing_plan import is_plan, read_plan
-    from walop_jax.simulation.simulate import as_planned
+    from walop_jax.simulation.simulate import simulate
 
     job.begin("reading")
     data, plan_file = fit_of(data), None
@@ -69,7 +69,7 @@ def limits(
         if isinstance(data, FitResult):
             result = data
         else:
-            taken = data if plan is None else as_planned(plan, job.seed + number)
+            taken = data if plan is None else simulate(plan, job.seed + number, noiseless=True).calset
             calset, chosen = set_and_model(taken, model, design, effects)  # pyright: ignore[reportArgumentType]
             result = examined(refit(calset, chosen, progress=progress), job.seed)
         if not result.converged:

@@ -281,9 +281,12 @@ def true_instrument(
     )
 
 
-def as_planned(plan: ObservingPlan, seed: int = 0) -> CalibrationSet:
-    """The set of `simulate` with the same seed, but for its noise: for judging a plan."""
-    return simulate(plan, seed, noiseless=True).calset
+def as_planned(plan: ObservingPlan) -> CalibrationSet:
+    """The set that the instrument as designed would give in steady weather, without noise: the layout of a plan.
+
+    What a plan will show depends on the instrument as built, and on the weather: `diagnosis.planned_limits`.
+    """
+    return simulate(plan, instrument=plan.design, noiseless=True, steady=True).calset
 
 
 def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: int) -> CalibrationSet:
