@@ -253,6 +253,8 @@ def _row(
 ) -> tuple[str, ...]:
     """A row of the table: a mistake as it could hide, or a limit of which no error is known."""
     error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
+    if hidden is not None and not any(hidden.error):
+        error = "none"
     if isinstance(limit, DetectionLimit):
         named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
         detected = two_digits_range(*limit.detected)

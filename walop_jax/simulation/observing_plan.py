@@ -78,13 +78,14 @@ def _angles_of(given: Any, full_turn: Any) -> tuple[float, ...]:
         if given < 1:
             raise ValueError(f"polariser_angles = {given} must be at least 1, or a list of angles (deg)")
         return polariser_turn(int(given), full_turn=bool(full_turn))
-    angles = np.asarray(given, float) if np.ndim(given) == 1 and not isinstance(given, str) else None
-    if angles is None or not np.isfinite(angles).all():
-        what = "must be a number of angles, such as 15, or a list of them (deg)"
-        raise ValueError(f"polariser_angles = {given!r} {what}")
-    if full_turn is not None:
+    listed = np.ndim(given) == 1
+    if listed and full_turn is not None:
         what = "is of no use beside a list of angles; give their number, or leave it out"
         raise ValueError(f"full_turn {what}")
+    angles = np.asarray(given, float) if listed else np.array(np.nan)
+    if not np.isfinite(angles).all():
+        what = "must be a number of angles, such as 15, or a list of them (deg)"
+        raise ValueError(f"polariser_angles = {given!r} {what}")
     return tuple(given) if isinstance(given, tuple) else tuple(angles.tolist())
 
 
@@ -169,7 +170,7 @@ class ObservingPlan:
     grid: int = 12
     field: float = NAN
     standard_grid: int = 5
-    polariser_angles: tuple[float, ...] | int = _USUAL_ANGLES
+    polariser_angles: Sequence[float] | Float[np.ndarray, " a"] | int = _USUAL_ANGLES
     moon_patches: int = 8
     separations: tuple[float, float] = (8.0, 20.0)
     standards: int = 8
@@ -532,8 +533,10 @@ def plan_of(
     content = dict(content)
     hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
     check_names("entry of a plan", content, hints)
-    listed = isinstance(content.get("polariser_angles"), list)
-    hints |= {"full_turn": bool, "polariser_angles": tuple[float, ...] if listed else Any}
+    angles, full_turn = content.get("polariser_angles", _USUAL_ANGLES), content.pop("full_turn", None)
+    if full_turn is not None or not isinstance(angles, list | tuple):
+        content["polariser_angles"] = list(_angles_of(angles, full_turn))
+    hints["polariser_angles"] = tuple[float, ...]
     named = instrument_named(content, folder)
     content.pop("instrument", None)
     instrument = named if instrument is None else instrument
