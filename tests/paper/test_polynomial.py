@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import walop_jax as walop
 from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.settings import Settings
@@ -160,6 +161,24 @@ def test_too_few_angles_are_refused():
     plan = ObservingPlan(grid=3, polariser_angles=polariser_turn(4), moon_patches=0, standards=0)
     with pytest.raises(DataError, match=r"4 polariser angles .* needs 5"):
         paper.fit_paper(simulate(plan).calset)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        # Eight angles of a full turn are four directions: the plan of a user.
+        ({"polariser_angles": 8, "full_turn": True}, r"4 polariser angles .* needs 5"),
+        ({"polariser_angles": 9, "filters": ("NB-660",)}, r"0 polariser angles .* in SDSS-r .* --filter"),
+    ],
+)
+def test_a_set_without_enough_angles_is_refused_before_the_joint_fit(monkeypatch, plan, message):
+    def fit(*args, **options):
+        raise AssertionError("the joint model was fitted, in vain")
+
+    monkeypatch.setattr("walop_jax.fit.refit.refit", fit)
+    calset = simulate(ObservingPlan(grid=2, moon_patches=0, standards=0, **plan)).calset
+    with pytest.raises(DataError, match=message):
+        walop.compare(calset)
 
 
 @pytest.mark.long

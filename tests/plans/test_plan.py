@@ -17,6 +17,7 @@ import walop_jax as walop
 from walop_jax.calibration.accuracy import p_errors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrix_slopes
+from walop_jax.data.inspection import inspect
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import in_memory
 from walop_jax.diagnosis.trust import examined
@@ -150,8 +151,13 @@ def test_errors_have_the_floor_of_the_instrument():
 
 def test_a_plan_is_proven_and_reads_back(planned, tmp_path):
     assert 0.0 <= planned.weights_gap <= 0.01
-    assert planned.value >= planned.bound
-    assert planned.gap <= 0.03
+    assert planned.value >= planned.bound_of_go >= planned.bound
+    # The best that a go leaves room for, but for the changes and a remainder too short for an exposure.
+    exposing = sum(line.seconds for line in planned.lines) / (15 * 60)
+    assert (planned.value / planned.bound_of_go) ** 2 <= 1.03 / exposing
+    assert exposing > 0.9
+    assert 0.6 < planned.efficiency <= 1.0
+    assert planned.efficiency == pytest.approx((planned.bound / planned.value) ** 2, rel=1e-12)
     assert planned.seconds <= 15 * 60
     assert all(line.left_out > 1.0 for line in planned.lines)
     assert min(planned.beside.values()) >= planned.bound
@@ -165,6 +171,82 @@ def test_a_plan_is_proven_and_reads_back(planned, tmp_path):
     for name in ("kind", "clp_angle", "mjd", "ra", "filter"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     assert "no plan of this time gets below" in repr(planned)
+
+
+def turn_of(exposures) -> tuple[int, float]:
+    """Number of directions behind the polariser, and the widest gap (deg) of its angles in a whole turn."""
+    angles = np.sort(np.mod(exposures.clp_angle[exposures.clp_in], 360.0))
+    gaps = np.diff(np.append(angles, angles[0] + 360.0))
+    return len(np.unique(np.mod(angles, 180.0).round(2))), float(gaps.max())
+
+
+def test_the_plan_of_a_night_contains_what_a_go_needs(planned):
+    """Two or three angles alone make p best. By hand: eight directions, over a full turn, and light from the sky."""
+    exposures = planned.observing_plan.exposures()
+    directions, gap = turn_of(exposures)
+    assert directions >= 8
+    assert gap <= 180.0
+    assert exposures.direct("moon", "standard").any()
+    assert planned.lacks == ()
+    assert repr(planned).startswith("Plan of ")
+    assert "a go needs it" in repr(planned)
+    calset = simulate(planned.observing_plan, noiseless=True, steady=True).calset
+    assert [str(finding) for finding in inspect(calset).findings] == []
+    shown = {line["kind"] for line in planned.document()["exposures"] if line["needed"]}
+    assert shown == {"clp", "moon"}
+
+
+def test_a_plan_without_the_sky_is_no_go_and_its_first_line_says_so(small, field):
+    """0.20 % of telescope polarisation, as `certify` would say it of a fit."""
+    indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
+    plan = plan_from(indoors, 15.0, criterion_by_name(small, field, "worst"), field)
+    first = repr(plan).splitlines()[0]
+    assert first.startswith("No go with this plan alone: ")
+    assert "telescope_polarisation.q, telescope_polarisation.u not measured" in first
+    assert "q or u off by 0.20 % (median) at the usual size" in first
+    assert "observe an unpolarised and a polarised standard, or the moonlit sky" in first
+    assert turn_of(plan.observing_plan.exposures())[0] >= 8
+    assert plan.document()["lacks"] == list(plan.lacks) != []
+
+
+def test_standards_show_the_sky_as_well(small, field):
+    """Without the Moon one star that is polarised and one that is not."""
+    keep = [i for i, choice in enumerate(small.choices) if choice.kind != "moon"]
+    starry = dataclasses.replace(
+        small,
+        choices=tuple(small.choices[i] for i in keep),
+        families=tuple(small.families[i] for i in keep),
+    )
+    plan = plan_from(starry, 20.0, criterion_by_name(small, field, "worst"), field)
+    numbers = {line.number for line in plan.lines if line.kind == "standard"}
+    assert numbers == {0, 1}  # of SMALL the first is unpolarised
+    assert plan.lacks == ()
+
+
+def test_a_time_that_does_not_pay_for_a_go(small, field):
+    plan = plan_from(small, 3.0, criterion_by_name(small, field, "worst"), field)
+    assert not any(line.needed for line in plan.lines)
+    assert repr(plan).startswith("No go with this plan alone: ")
+
+
+def test_what_a_calibration_has_already_counts(small, field):
+    """Ten minutes beside a run with the sky and eight directions over a full turn are as they were."""
+    criterion = criterion_by_name(small, field, "worst")
+    information = np.diag(np.full(len(small.names), 1e6))
+    run = dataclasses.replace(SMALL, polariser_angles=tuple(40.0 * k for k in range(9))).exposures()
+    beside = plan_from(small, 10.0, criterion, field, known=information, had=(run,))
+    assert not any(line.needed for line in beside.lines)
+    assert beside.efficiency >= 0.95
+    assert not repr(beside).startswith("No go")
+    blind = dataclasses.replace(SMALL, moon_patches=0, standards=0, unpolarised=0).exposures()
+    beside = plan_from(small, 10.0, criterion, field, known=information, had=(blind,))
+    assert {line.kind for line in beside.lines if line.needed} == {"moon"}  # it has 15 directions
+
+
+def test_nothing_known_is_no_error(planned):
+    """154 % of p was said of stars with 5 % of p at most."""
+    assert np.median(planned.before[np.isfinite(planned.before)]) > 0.05
+    assert "nothing known without them" in repr(planned)
 
 
 def test_exposures_that_come_when_the_night_is_over_are_told():

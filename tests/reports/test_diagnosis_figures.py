@@ -173,6 +173,26 @@ def test_the_error_of_p_of_any_goal_and_of_nothing_before():
     assert [shown.get_array().tolist() for shown in tiles(figure)] == [[], [0.1]]
 
 
+def test_tiles_of_two_rasters_do_not_overlap():
+    """9 × 9 field points, and 3 × 3 of standards between them: tiles of one size lay over each other."""
+    sides = (np.linspace(-0.29, 0.29, 9), np.linspace(-0.232, 0.232, 3))
+    x, y = (
+        np.concatenate([grid.ravel() for grid in axis])
+        for axis in zip(*(np.meshgrid(s, s) for s in sides), strict=True)
+    )
+    figure = Figure()
+    drawn = point_map(figure.subplots(), "", x, y, np.arange(90.0), Normalize(0.0, 1.0), "viridis")
+    boxes = np.array([path.get_extents().extents for path in drawn.get_paths()])
+    low, high = boxes[:, None, :2], boxes[:, None, 2:]
+    overlap = np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1))
+    lies_over = (overlap > 1e-9).all(axis=2)
+    # The centre is a point of both rasters: one place, one value.
+    assert [pair.tolist() for pair in np.argwhere(np.triu(lies_over, 1))] == [[40, 85]]
+    size = boxes[:, 2] - boxes[:, 0]
+    assert size.max() == pytest.approx(0.0725)  # where no standard is near neighbours touch
+    assert np.sum(size > 0.0724) > 50
+
+
 def test_a_single_point_has_a_tile():
     axis = Figure().subplots()
     zero = np.zeros(1)

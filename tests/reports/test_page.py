@@ -231,6 +231,10 @@ def test_patterns_without_a_name(tmp_path):
     assert page.row("gradients") == ["gradients", "< 10⁻¹⁵"]
     assert len(page.images) == 9  # two steps (the second of a kind that has no name), rms over all exposures
     assert "walop-jax apply" not in page.text
+    # More exposures do not explain an unknown effect: the next step is what the diagnosis saw.
+    assert "walop-jax plan" not in page.text
+    assert "say what makes gradients" in page.text
+    assert "--effects OWN.toml" in page.text
 
 
 def test_page_of_an_untrusted_fit(tmp_path, blank_figures):

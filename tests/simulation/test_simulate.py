@@ -28,7 +28,13 @@ from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import make_model, with_effects
-from walop_jax.simulation.observing_plan import NARROW_BANDS, ObservingPlan, filter_curve, polariser_turn
+from walop_jax.simulation.observing_plan import (
+    NARROW_BANDS,
+    ObservingPlan,
+    filter_curve,
+    polariser_turn,
+    read_plan,
+)
 from walop_jax.simulation.simulate import Simulated, draw_instrument, simulate, true_instrument, truth_values
 from walop_jax.sky.moon import body_direction
 
@@ -411,6 +417,53 @@ def test_without_a_polariser_there_are_no_exposures_through_one(tmp_path):
         dataclasses.replace(plan, polariser_angles=(0.0, 90.0))
     with pytest.raises(ValueError, match="no exposures"):
         dataclasses.replace(plan, lamps=0)
+
+
+@pytest.mark.parametrize("full_turn", [None, False, True])
+def test_a_number_of_polariser_angles_is_the_same_in_python_and_in_a_file(tmp_path, full_turn):
+    step = 40.0 if full_turn else 20.0
+    angles = tuple(step * k for k in range(9))
+    word = {} if full_turn is None else {"full_turn": full_turn}
+    assert ObservingPlan(polariser_angles=9, **word).polariser_angles == angles
+    path = tmp_path / "plan.toml"
+    path.write_text("polariser_angles = 9\n" + "".join(f"{k} = {str(v).lower()}\n" for k, v in word.items()))
+    assert read_plan(path) == ObservingPlan(polariser_angles=angles)
+    # What is made of it stays: another entry does not ask again.
+    changed = dataclasses.replace(ObservingPlan(polariser_angles=9, **word), grid=3)
+    assert changed.polariser_angles == angles
+    assert ObservingPlan(full_turn=True).polariser_angles == tuple(24.0 * k for k in range(15))
+    assert ObservingPlan(polariser_angles=np.array([0.0, 60.0])).polariser_angles == (0.0, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("polariser_angles = 0", "must be at least 1, or a list of angles"),
+        ("polariser_angles = 8.5", "must be a number of angles, such as 15, or a list"),
+        ("polariser_angles = true", "must be a number of angles, such as 15, or a list"),
+        ('polariser_angles = "8"', "must be a number of angles, such as 15, or a list"),
+        ("polariser_angles = [0, 60]\nfull_turn = true", "of no use beside a list"),
+        ('full_turn = "yes"', "full_turn = 'yes' must be true or false"),
+    ],
+)
+def test_angles_that_are_neither_a_number_nor_a_list(tmp_path, text, message):
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_plan(path)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"polariser_angles": 0}, "must be at least 1, or a list of angles"),
+        ({"polariser_angles": True}, "must be a number of angles, such as 15, or a list"),
+        ({"polariser_angles": (0.0, 60.0), "full_turn": True}, "of no use beside a list"),
+    ],
+)
+def test_the_same_in_python(entries, message):
+    with pytest.raises(ValueError, match=message):
+        ObservingPlan(**entries)
 
 
 def test_every_standard_has_a_name_of_its_own():

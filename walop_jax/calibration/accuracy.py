@@ -20,6 +20,7 @@ SMALLEST_DETERMINANT = 0.1
 SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
 SIZE = 21  # points along each axis of a map of the field
 NODES = (10, 14, 20, 28)
+_ROUNDING = 1e-12  # of q and u: what the rounding of matrices may make of nothing
 TOLERANCE = 1e-2  # relative, of errors that are given with two digits
 
 
@@ -72,7 +73,10 @@ def judged(without_u: float) -> str:
 
 
 def change_of_qu(assumed: Matrices, true: Matrices) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars with p ≤ `LARGEST_P`; NaN where not measured."""
+    """Largest error of q and u at each field point for stars with p ≤ `LARGEST_P`; NaN where not measured.
+
+    What is no more than the rounding of the matrices is 0.
+    """
     errors = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
         return errors
@@ -81,7 +85,7 @@ def change_of_qu(assumed: Matrices, true: Matrices) -> Float[np.ndarray, " p"]:
     change = (true - assumed)[good]
     offset = np.linalg.norm(inverse @ change[:, :, :1], axis=(1, 2))
     errors[good] = offset + LARGEST_P * np.linalg.norm(inverse @ change[:, :, 1:], ord=2, axis=(1, 2))
-    return errors
+    return np.where(errors < _ROUNDING, 0.0, errors)
 
 
 def largest_change(assumed: Matrices, true: Matrices) -> float:

@@ -7,19 +7,23 @@ model); it remains to check whether it agrees with its own parameters, and wheth
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
-from walop_jax.calibration.could_hide import could_hide, off_by, unmeasured
+from walop_jax.calibration.could_hide import could_hide, off_by, shown_by_the_sky_alone, unmeasured
 from walop_jax.calibration.product import validity
+from walop_jax.data.inspection import Finding, about_exposures, sees_the_sky
+from walop_jax.data.records import Exposures
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
 from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.effects.base import Context
+from walop_jax.model.instrument import Instrument
 
 MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on another machine
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
@@ -27,6 +31,7 @@ SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 UNMEASURED = 5e-4
 """Error of q and u (median over the field) allowed to a mistake without any data on it."""
 _POINTS = 64
+OF_THE_SKY = "observe an unpolarised and a polarised standard, or the moonlit sky"
 
 
 class Check(NamedTuple):
@@ -48,6 +53,22 @@ def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> li
         return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
     return [*checks, _maps(product, calibration), _physics(calibration), *_protection(calibration)]
+
+
+def lacks(
+    instrument: Instrument, catalogue: Iterable[EffectKind], context: Context, *taken: Exposures
+) -> Iterator[Finding]:
+    """What lists of exposures, taken or planned, lack together for a go, whatever they count.
+
+    The faults that `inspect` would find, and the mistakes that `certify` would not call measured.
+    """
+    yield from (finding for finding in about_exposures(*taken) if finding.severity == "fault")
+    if not sees_the_sky(*taken):
+        ahead = shown_by_the_sky_alone(instrument, catalogue, context)
+        unseen = {name: error for name, error in ahead.items() if error > UNMEASURED}
+        if unseen:
+            worst = off_by(max(unseen.values()), float("nan"))
+            yield Finding("fault", f"{', '.join(unseen)} not measured, {worst} at the usual size", OF_THE_SKY)
 
 
 def _verdict(product: Product) -> list[Check]:

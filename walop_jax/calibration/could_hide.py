@@ -28,7 +28,8 @@ from walop_jax.data.settings import Settings
 from walop_jax.io.text import rounded, two_digits
 from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light
-from walop_jax.model.effects import Change, Effect, effect_by_name, in_order
+from walop_jax.model.effects import Change, Effect, EffectKind, effect_by_name, in_order
+from walop_jax.model.effects.base import Context
 from walop_jax.model.effects.numbers import OF_POLARISER
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
@@ -95,8 +96,9 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     if not errors.size:
         return ()
     acting, mistakes = acting_effects(calibration), list[CouldHide]()
+    at_values = calibration.model.instrument(calibration.values)
     for number, (m, of_field) in enumerate(zip(hidden.mistakes, errors, strict=True)):
-        ahead = not m.measured and number in acting and is_ahead(calibration, acting[number])
+        ahead = not m.measured and number in acting and is_ahead(at_values, acting[number])
         error = float(np.median(of_field)), float(of_field.max())
         if error[1] > 0.0:
             mistakes.append(CouldHide(m.name, m.kind, m.size, m.unit, m.remedy, m.measured, ahead, error))
@@ -174,12 +176,43 @@ def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
     return not needed or any(np.isfinite(settings.position(prefix)).any() for prefix in needed)
 
 
-def is_ahead(calibration: Calibration, effect: Effect) -> bool:
+def is_ahead(instrument: Instrument, effect: Effect) -> bool:
     """True if an effect acts on the light from the sky ahead of the polariser, or turns the sky."""
-    instrument, zero = calibration.model.instrument(calibration.values), jnp.zeros(())
-    models = with_effect(instrument, effect), instrument
-    after, before = (np.asarray(light.telescope(model, zero, zero)) for model in models)
+    after, before = (_telescope(model) for model in (with_effect(instrument, effect), instrument))
     return bool(np.any(after != before)) or turn_of(instrument, effect) != 0.0
+
+
+def _telescope(instrument: Instrument) -> Float[np.ndarray, "4 4"]:
+    """Mueller matrix ahead of the polariser, at the centre of the field."""
+    return np.asarray(light.telescope(instrument, jnp.zeros(()), jnp.zeros(())))
+
+
+def shown_by_the_sky_alone(
+    instrument: Instrument, catalogue: Iterable[EffectKind], context: Context
+) -> dict[str, float]:
+    """Amplitudes of effects that act ahead of the polariser, and their errors of q and u of stars at the usual size.
+
+    No exposure through the polariser shows them, whatever it counts. The error is the same in all cameras, all over the
+    field. None where one exposure does not give q and u, as in `could_hide`.
+    """
+    if len(instrument.cameras.pairs) != 2:
+        return {}
+    bare, errors = dataclasses.replace(instrument, effects=()), dict[str, float]()
+    before = _telescope(bare)
+    for kind in catalogue:
+        neutral = kind.neutral(context)
+        if kind.is_structural() or neutral.lacks(bare):
+            continue
+        widths = list(neutral.prior_widths(context).items())
+        if not is_ahead(bare, neutral.moved([width for _, width in widths])):
+            continue
+        for number, (name, width) in enumerate(widths):
+            effect = neutral.moved(np.eye(len(widths))[number] * width)
+            if is_ahead(bare, effect):
+                after, turn = _telescope(with_effect(bare, effect)), turn_of(bare, effect)
+                stokes = [matrix[None, 1:3, :3] / matrix[0, 0] for matrix in (before, after)]
+                errors[f"{kind.name}.{name}"] = float(change_of_qu(*stokes)[0]) + 2.0 * LARGEST_P * abs(turn)
+    return errors
 
 
 def with_effect(instrument: Instrument, effect: Effect) -> Instrument:

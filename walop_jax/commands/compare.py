@@ -39,8 +39,9 @@ def compare(
     the spectral appendix and the full-Moon scheme. (Two calibrations are compared by epoch.)
 
     In Python: a `Comparison`; `calibration` is the joint fit (default: made here), `truth` a file, or (x, y, matrices)
-    in memory, in degrees. Raises ValueError if the fit does not converge, and for a `calibration` or `truth` in memory
-    together with `output`.
+    in memory, in degrees. Raises `DataError`, ahead of the joint fit, for a set with too few polariser angles for
+    the polynomial, ValueError if the fit does not converge, and for a `calibration` or `truth` in memory together with
+    `output`.
 
     >>> walop.compare("night.fits").document()["between"]  # doctest: +SKIP
     """
@@ -49,6 +50,7 @@ def compare(
     from walop_jax.fit.refit import refit
     from walop_jax.io.plain_tables import astropy_table, write_table
     from walop_jax.paper.comparison import compare as comparison_of
+    from walop_jax.paper.comparison import published_method
     from walop_jax.reports import paper_figures
     from walop_jax.science.field_points import true_matrices
     from walop_jax.science.star_errors import Truth
@@ -67,6 +69,8 @@ def compare(
     if truth is not None:
         in_memory = isinstance(truth, tuple)
         truth = Truth(*(truth if in_memory else true_matrices(truth, chosen.template.patched())))
+    # Ahead of the joint fit, which takes longer: it is in vain where the polynomials cannot be fitted.
+    published = published_method(calset, truth, filter, job.seed)
     if held is None:
         job.tell("fitting the joint model", "fitting")
         result = examined(refit(calset, chosen, progress=job.progress), job.seed)
@@ -75,8 +79,8 @@ def compare(
         joint, trusted, warnings = Calibration.from_fit(result), result.trusted, result.warnings
     else:
         joint, trusted, warnings = held, held.verdict.trusted, held.warnings
-    job.tell("fitting and judging the polynomials", "judging")
-    compared = comparison_of(calset, joint, truth, filter, job.seed)
+    job.tell("judging the polynomials", "judging")
+    compared = comparison_of(calset, joint, truth, filter, job.seed, published=published)
     lost = joint.left_behind
     columns = {name: (values, "", about) for name, (values, about) in compared.columns().items()}
     table = astropy_table(columns, products.left_out_cards(lost))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +37,8 @@ def limits(
     """Compute the size at which every effect would be detected and named in calibration sets.
 
     And what those may be that are too small: the largest error of q and u that a single effect can make over the field
-    without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any data are taken.
+    without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any data are taken,
+    over instruments as they may be built.
 
     In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
     effect and parameter. Raises ValueError for a fit that does not converge.
@@ -45,12 +46,13 @@ def limits(
     >>> walop.limits("night.fits").protection_in_words()  # doctest: +SKIP
     """
     from walop_jax import FitResult, ObservingPlan
-    from walop_jax.diagnosis.detection_limits import detection_limits
+    from walop_jax.diagnosis.detection_limits import DetectionLimits, detection_limits
+    from walop_jax.diagnosis.planned_limits import INSTRUMENTS, over_instruments
     from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.refit import refit
     from walop_jax.reports.diagnosis_figures import protection_figure, separation_figure
     from walop_jax.simulation.observing_plan import is_plan, read_plan
-    from walop_jax.simulation.simulate import as_planned
+    from walop_jax.simulation.simulate import simulate
 
     job.begin("reading")
     data, plan_file = fit_of(data), None
@@ -59,17 +61,22 @@ def limits(
         paths = paths_of(data)
         if len(paths) == 1 and is_plan(paths[0]):
             plan_file, plan = paths[0], read_plan(paths[0], instrument)  # pyright: ignore[reportArgumentType]
-    if isinstance(data, FitResult):
-        result = data
-    else:
-        planned = data if plan is None else as_planned(plan)
-        design = instrument if plan is None else plan.design
-        calset, chosen = set_and_model(planned, model, design, effects)  # pyright: ignore[reportArgumentType]
-        result = examined(refit(calset, chosen, progress=job.progress), job.seed)
-    if not result.converged:
-        raise ValueError(f"the fit did not converge ({result.minimum.message})")
-    effect_kinds = None if effects is None else catalogue_of(effects)
-    limits_of_data = detection_limits(result, catalogue=effect_kinds, seed=job.seed, progress=job.progress)
+    kinds = None if effects is None else catalogue_of(effects)
+    design = instrument if plan is None else plan.design
+    results, of_sets = list[FitResult](), list[DetectionLimits]()
+    for number in range(1 if plan is None else INSTRUMENTS):
+        progress = _of_instrument(job, number)
+        if isinstance(data, FitResult):
+            result = data
+        else:
+            taken = data if plan is None else simulate(plan, job.seed + number, noiseless=True).calset
+            calset, chosen = set_and_model(taken, model, design, effects)  # pyright: ignore[reportArgumentType]
+            result = examined(refit(calset, chosen, progress=progress), job.seed)
+        if not result.converged:
+            raise ValueError(f"the fit did not converge ({result.minimum.message})")
+        results.append(result)
+        of_sets.append(detection_limits(result, catalogue=kinds, seed=job.seed, progress=progress))
+    limits_of_data, result = over_instruments(of_sets), results[0]
     steps = ()
     if output is not None:
         available = plan_file or instrument or result.model.name
@@ -81,7 +88,7 @@ def limits(
             "effects_of_the_model": list(result.model.effect_names),
             "inputs": [{"path": str(entry.path), "sha256": entry.sha256} for entry in result.calset.inputs],
             "plan": None if plan is None else plan.document(),
-            "trusted": result.trusted,
+            "trusted": all(one.trusted for one in results),
             "seed": job.seed,
         },
         files={
@@ -92,6 +99,11 @@ def limits(
         next=steps,
         warnings=tuple(f"the fit: {text}" for text in result.warnings),
     )
+
+
+def _of_instrument(job: Job, number: int) -> Callable[[str], None]:
+    """Progress with one of the instruments of a plan, from 0: the stages are those of the first."""
+    return job.progress if not number else lambda text: job.progress(f"instrument {number + 1}: {text}")
 
 
 def _plan(available: object, output: Path, result: FitResult) -> str:

@@ -24,7 +24,8 @@ from walop_jax.io.text import rounded
 Severity = Literal["fault", "doubt", "note"]
 
 _LOOKED_AT = 1024  # field points whose intensities are looked at; of frames, in evenly spaced runs
-_FEW_ANGLES = 8
+FEW_ANGLES = 8
+"""Angles of the polariser modulo 180° below which a set is in doubt."""
 _FEWEST_SETTINGS = 3
 _NARROW = 30.0  # degrees
 _FEW_POINTS = 15
@@ -231,7 +232,9 @@ def inspect(calset: CalibrationSet) -> Inspection:
         filters=tuple(calset.filters),
         findings=(),
     )
-    findings = (*_findings(calset, inspection), *_about_cameras(by_camera), *_about_settings(e, live))
+    taken = e[np.flatnonzero(live)]
+    settings = _about_settings([taken], " with usable data")
+    findings = (*_findings(calset, inspection), *_about_cameras(by_camera), *settings)
     notes = (Finding("note", remark) for remark in calset.remarks)
     return dataclasses.replace(inspection, findings=(*findings, *notes))
 
@@ -279,7 +282,7 @@ def _flags(calset: CalibrationSet) -> dict[str, int]:
 
 def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if not calset.exposures.further:
-        yield from _about_angles(made)
+        yield from _about_angles(made.angles, " with usable data")
     if made.points < 2:
         # The needs of other instruments are in their descriptions.
         severity = "fault" if calset.instrument in shipped() else "note"
@@ -291,7 +294,7 @@ def _findings(calset: CalibrationSet, made: Inspection) -> Iterator[Finding]:
     if np.isfinite(made.noise_ratio) and not _NOISE[0] <= made.noise_ratio <= _NOISE[1]:
         what = f"the errors are {np.sqrt(made.noise_ratio):.3g} times the photon noise sqrt(N)"
         yield Finding("doubt", what, "are N and N_ERR in electrons, or in counts (multiply by the gain)?")
-    yield from about_exposures(calset.exposures)
+    yield from _about_light(calset.exposures)
     everywhere = made.points * len(calset.exposures)  # flags are those of all points, not of those looked at
     if (saturated := made.flags.get(DataFlag.SATURATED.meaning, 0)) > _MUCH * everywhere:
         yield Finding("doubt", f"{saturated} rows are saturated", "expose for a shorter time")
@@ -308,41 +311,58 @@ def _about_cameras(noise_ratio: np.ndarray) -> Iterator[Finding]:
         yield Finding("doubt", f"N_ERR²/N differs between the cameras: {listed}", advice)
 
 
-def _about_angles(made: Inspection) -> Iterator[Finding]:
-    number, span = len(made.angles), 180.0 - made.widest_gap
+def about_exposures(*taken: Exposures) -> Iterator[Finding]:
+    """Findings on what lists of exposures, taken or planned, cannot show together, whatever their counts are."""
+    if not any(e.further for e in taken):
+        yield from _about_angles(
+            _distinct(np.mod(np.concatenate([e.clp_angle[e.clp_in] for e in taken]), 180.0))
+        )
+    yield from _about_light(*taken)
+    yield from _about_settings(taken)
+
+
+def _about_angles(angles: tuple[float, ...], of_what: str = "") -> Iterator[Finding]:
+    """Findings on the distinct angles of the polariser (deg, modulo 180)."""
+    number, span = len(angles), 180.0 - _widest_gap(np.array(angles), 180.0)
     if number < 3:
-        what = f"{number} distinct polariser angle(s) modulo 180° with usable data"
+        what = f"{number} distinct polariser angle(s) modulo 180°{of_what}"
         yield Finding("fault", what, "a fit needs at least 3, better 15 spread over 360°")
     elif span < _NARROW:
         yield Finding("doubt", f"all polariser angles lie within {span:.3g}°", "spread them over 180°")
-    elif number < _FEW_ANGLES:
-        advice = "with fewer than 8, polariser errors cannot be separated from instrument errors"
+    elif number < FEW_ANGLES:
+        advice = f"with fewer than {FEW_ANGLES}, polariser errors cannot be separated from instrument errors"
         yield Finding("doubt", f"only {number} polariser angles modulo 180°", advice)
 
 
-def about_exposures(exposures: Exposures) -> Iterator[Finding]:
-    """Notes on what exposures, taken or planned, cannot show whatever their counts are."""
-    e = exposures
-    if e.clp_in.any() and not e.further and _widest_gap(e.clp_angle[e.clp_in], 360.0) > 180.0:
+def _about_light(*taken: Exposures) -> Iterator[Finding]:
+    """Notes on the turn of the polariser, and on light that does not pass it."""
+    angles = np.concatenate([e.clp_angle[e.clp_in] for e in taken])
+    if len(angles) and not any(e.further for e in taken) and _widest_gap(angles, 360.0) > 180.0:
         advice = "a full turn is needed to separate an encoder wobble from the instrument"
         yield Finding("note", "the polariser turns through half a turn only", advice)
-    if not np.any(e.direct("moon", "standard")):
+    if not sees_the_sky(*taken):
         what = "the only light of known polarisation is that through the polariser (neither moonlit sky nor standards)"
         advice = "without these, neither the zero of the polariser nor telescope polarisation can be measured"
         yield Finding("note", what, advice)
 
 
-def _about_settings(exposures: Exposures, live: np.ndarray) -> Iterator[Finding]:
+def sees_the_sky(*taken: Exposures) -> bool:
+    """True where light of a known polarisation comes from the sky: exposures of the Moon, or of standards."""
+    return any(bool(np.any(e.direct("moon", "standard"))) for e in taken)
+
+
+def _about_settings(taken: Sequence[Exposures], of_what: str = "") -> Iterator[Finding]:
     """Findings where further elements move: which of them does the polariser's work is not known here."""
-    if not exposures.further:
+    if not any(e.further for e in taken):
         return
-    used = exposures[np.flatnonzero(live)]
-    angles = [position.angle.astype(str) for position in used.positions.values()]
-    distinct = len(set(zip(*angles, strict=True)))
-    if distinct < _FEWEST_SETTINGS:
-        what = f"{distinct} distinct setting(s) of the moving elements with usable data"
+    distinct = set[tuple[str, ...]]()
+    for used in taken:
+        angles = [position.angle.astype(str) for position in used.positions.values()]
+        distinct |= set(zip(*angles, strict=True))
+    if len(distinct) < _FEWEST_SETTINGS:
+        what = f"{len(distinct)} distinct setting(s) of the moving elements{of_what}"
         yield Finding("fault", what, f"a fit needs at least {_FEWEST_SETTINGS}")
-    for prefix, position in used.positions.items():
+    for prefix, position in (pair for used in taken for pair in used.positions.items()):
         if like_radians(position.angle[position.inside]):
             what = f"the angles of {prefix} look like radians"
             yield Finding("doubt", what, f"{prefix}_ANGLE is in degrees")

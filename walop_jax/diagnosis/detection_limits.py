@@ -114,7 +114,8 @@ class DetectionLimits(Displayed):
     detected. `protection` is, by field point (`x`, `y`, degrees), the largest error of q and u that a single effect
     can make without being detected, with a margin of a tenth for higher orders, `caused_by` the effect.
     `untestable` effects leave no trace in these data. `conditions` are those stated in the set: its field, its
-    filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command.
+    filters, the colours of its light. `could_hide` are the undetectable mistakes, as in every command. Of an observing
+    plan all of it is over `instruments` as they may be built (`planned_limits`).
     """
 
     limits: tuple[DetectionLimit, ...]
@@ -127,6 +128,7 @@ class DetectionLimits(Displayed):
     untestable: tuple[str, ...]
     conditions: tuple[ConditionLimit, ...] = ()
     could_hide: tuple[CouldHide, ...] = ()
+    instruments: int = 1
 
     def to_table(self) -> Any:
         """A row for each effect and parameter, the largest error of q and u first, as an astropy table."""
@@ -163,6 +165,7 @@ class DetectionLimits(Displayed):
             "untestable": list(self.untestable),
             "conditions": [entry._asdict() for entry in self.conditions],
             "could_hide": [mistake._asdict() for mistake in self.could_hide],
+            "instruments": self.instruments,
         }
 
     @classmethod
@@ -180,6 +183,7 @@ class DetectionLimits(Displayed):
             untestable=tuple(document["untestable"]),
             conditions=_records(ConditionLimit, document.get("conditions", ()), "detected"),
             could_hide=_records(CouldHide, document.get("could_hide", ()), ""),
+            instruments=int(document.get("instruments", 1)),
         )
 
     @property
@@ -212,13 +216,18 @@ class DetectionLimits(Displayed):
             if names:
                 rows.append((title, *("",) * (len(HEAD) - 1)))
             rows += [_row(name, mistakes.get(name), limits[kind].get(name)) for name in names]
-        undetected = f"cannot be detected in these data: {', '.join(self.untestable)}"
+        notes = [f"cannot be detected in these data: {', '.join(self.untestable)}"] if self.untestable else []
+        if self.instruments > 1:
+            what = f"of {self.instruments} instruments as they may be built, drawn from the priors"
+            notes.append(
+                f"{what}: detected with the best of them and with the worst, all else with the worst"
+            )
         return Display(
             title="What these data can show, with 99 % probability",
             facts=(("undetectable", self.protection_in_words() or NO_LEVEL),),
             head=HEAD,
             rows=tuple(rows),
-            notes=(undetected,) if self.untestable else (),
+            notes=tuple(notes),
         )
 
     def protection_in_words(self) -> str:
@@ -244,6 +253,8 @@ def _row(
 ) -> tuple[str, ...]:
     """A row of the table: a mistake as it could hide, or a limit of which no error is known."""
     error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
+    if hidden is not None and not any(hidden.error):
+        error = "none"
     if isinstance(limit, DetectionLimit):
         named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
         detected = two_digits_range(*limit.detected)

@@ -15,7 +15,7 @@ fixes what noise does not; intensities never have the question.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -197,6 +197,36 @@ def _summary(values: Float[np.ndarray, " p"]) -> dict[str, float]:
     return {"median": float(np.median(values)), "max": float(values.max())}
 
 
+class Published(NamedTuple):
+    """Paper II's method on a set, which needs no other calibration: at its grid points, and `between` them."""
+
+    paper: PaperCalibration
+    between: PaperCalibration
+    stars: Float[np.ndarray, "n 2"]
+
+
+def published_method(
+    calset: CalibrationSet,
+    truth: Truth | None = None,
+    filter_name: str = DEFAULT_FILTER,
+    seed: int = 0,
+    count: int = 400,
+) -> Published:
+    """Run Paper II's method on a set, and interpolate it to the points of `truth`, or to `count` random ones.
+
+    Raises `DataError` and ValueError as `fit_paper` and `PaperCalibration.between`: a set on which the method cannot be
+    run is refused here, before anything else is fitted to it.
+    """
+    stars = sample_stars(seed=seed)
+    paper = polynomial.fit_paper(calset, filter_name, stars)
+    if truth is None:
+        rng = np.random.default_rng([seed, 1])
+        x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
+    else:
+        x, y = truth.x, truth.y
+    return Published(paper, paper.between(x, y), stars)
+
+
 def compare(
     calset: CalibrationSet,
     calibration: Calibration,
@@ -204,14 +234,15 @@ def compare(
     filter_name: str = DEFAULT_FILTER,
     seed: int = 0,
     count: int = 400,
+    *,
+    published: Published | None = None,
 ) -> Comparison:
-    """Run Paper II's method on a set and judge it beside a calibration of the same set.
+    """Judge Paper II's method on a set beside a calibration of the same set.
 
-    The stars have the colour of the source behind the polariser. Without `truth`, `count` random points lie
-    between the grid points. Raises `DataError` and ValueError as `fit_paper` and `PaperCalibration.between`.
+    The stars have the colour of the source behind the polariser. `published` is the result of `published_method` for
+    the same set, truth, filter, seed and `count`, which is run here otherwise, and raises as it does.
     """
-    stars = sample_stars(seed=seed)
-    paper = polynomial.fit_paper(calset, filter_name, stars)
+    paper, between, stars = published or published_method(calset, truth, filter_name, seed, count)
     exposures = polynomial.polariser_exposures(calset, filter_name)
     teff = float(np.median(calset.exposures.teff[exposures]))
     analysis, setting = AnalysisVectors(calibration), Settings.default(1, filter_name)
@@ -231,12 +262,8 @@ def compare(
             of_joint = star_errors.joint_errors(joint, reference, stars)
         return MethodErrors(x, y, of_paper, of_joint, np.abs(determinant(reference)) < SMALLEST_DETERMINANT)
 
-    if truth is None:
-        rng, true = np.random.default_rng([seed, 1]), None
-        x, y = (rng.uniform(edge.min(), edge.max(), count) for edge in (paper.x, paper.y))
-    else:
-        x, y = truth.x, truth.y
-        true = star_errors.truth_vectors(vectors(x, y), truth.matrix)
+    x, y = between.x, between.y
+    true = None if truth is None else star_errors.truth_vectors(vectors(x, y), truth.matrix)
     on_grid = vectors(paper.x, paper.y)
     block = calset.intensities.block(0, len(calset.points))
     complete = block.used[:, exposures].all(axis=1)
@@ -251,7 +278,7 @@ def compare(
         paper=paper,
         offsets=offsets(paper, measured, states, on_grid, stars),
         grid=errors_at(paper.x, paper.y, paper, None),
-        between=errors_at(x, y, paper.between(x, y), true),
+        between=errors_at(x, y, between, true),
         truth=truth is not None,
         filter=filter_name,
         teff=teff,

@@ -8,6 +8,8 @@ Plate        Where it may stand at any angle the bound holds for all of them; ex
 Order        Settings one after the other, the polariser turning one way in each, then the sky, the nearest pointing
              next. Changes of filter, moving elements and pointing take time from the budget; whether a setting is worth
              its change is tried. The bound ignores changes, and holds for every order.
+Go           A plan contains what a go needs (`needs`), and optimises the rest of its time. The bound holds for plans
+             without it as well: the distance from it is the price.
 """
 
 from __future__ import annotations
@@ -15,25 +17,28 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import GOAL
+from walop_jax.calibration import certify
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.inspection import about_exposures
+from walop_jax.data.records import Exposures
 from walop_jax.data.user_tables import InputTable
-from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
-from walop_jax.plans import criteria, optimal
-from walop_jax.plans.available import Available, with_stops
+from walop_jax.plans import criteria, needs, optimal
+from walop_jax.plans.available import Available, CandidateExposure, with_stops
 from walop_jax.plans.criteria import Criterion, FieldErrors
+from walop_jax.plans.exposure_plan import ExposurePlan, PlannedExposure
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import GAP, Allocation, Experiment, NotEstimableError
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.science.field_accuracy import known_in_half
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
 from walop_jax.sky.directions import separation
 
 _NOTHING = 1e-6  # of the prior information: less of it makes no plan
@@ -53,150 +58,12 @@ Harrington & de Wijn 2026, arXiv:2602.13997). A full turn of the polariser says 
 
 
 class Line(NamedTuple):
-    """Exposures of a plan that are the same: number of the choice, place in it, how often."""
+    """Exposures of a plan that are the same: number of the choice, place in it, how often; half a turn `later`?"""
 
     choice: int
     place: tuple[float, ...]
     times: int
-
-
-@dataclasses.dataclass(frozen=True)
-class PlannedExposure:
-    """One line of a plan: settings, number of exposures, the time (s) of all of them, and their gain.
-
-    `number` is that of the Moon patch or star, −1 through the polariser; `place` that of a star in its raster (None:
-    all). `exptime` (s) is of one exposure, `change` (s) the time until the first can begin. `left_out` is the factor by
-    which the criterion grows without this line, `one_more` the one by which it falls with another exposure.
-    """
-
-    kind: str
-    filter: str
-    positions: Mapping[str, float | None]
-    polariser_angle: float
-    number: int
-    times: int
-    seconds: float
-    left_out: float
-    one_more: float
-    exptime: float
-    change: float
-    place: int | None = None
-
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table of a plan."""
-        number = "" if self.number < 0 else f" {self.number}"
-        positions = ", ".join(f"{p} {_angle(a)}" for p, a in self.positions.items())
-        angle = _angle(self.polariser_angle if np.isfinite(self.polariser_angle) else None)
-        exposures, time = f"{self.times} × {self.exptime:g} s", f"{self.seconds + self.change:.0f}"
-        what = f"{self.kind}{number}" + ("" if self.place is None else f" at {self.place}")
-        loss = f"{100 * (np.sqrt(self.left_out) - 1):+.2g} %"
-        return (what, self.filter, positions, angle, exposures, time, loss)
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ExposurePlan(Displayed):
-    """The exposures of a budget, the proof, and the error of p over the field before and after.
-
-    `value` is the criterion of the exposures, `bound` the least value of any plan of the same time, both as `criteria`
-    reports them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
-    none can. `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure
-    holds no u. `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left
-    out, and what these exposures alone cannot show. The bound holds for all angles of the polariser, and of the
-    calibration plate behind it if `any_plate`.
-    """
-
-    minutes: float
-    lines: tuple[PlannedExposure, ...]
-    criterion: Criterion
-    value: float
-    bound: float
-    weights_gap: float
-    truncation: float
-    goal: float | None
-    needed: tuple[float, float] | None
-    x: Float[np.ndarray, " p"]
-    y: Float[np.ndarray, " p"]
-    before: Float[np.ndarray, "r p"]
-    after: Float[np.ndarray, "r p"]
-    beside: Mapping[str, float]
-    observing_plan: ObservingPlan
-    notes: tuple[str, ...] = ()
-    any_plate: bool = False
-
-    @property
-    def gap(self) -> float:
-        """Proven relative distance of the exposures' variance from the best: that of the criterion of `optimal`."""
-        return self.criterion.variance(self.value) / self.criterion.variance(self.bound) - 1.0
-
-    @property
-    def share(self) -> float | None:
-        """Share of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
-        errors = self.after[:, np.isfinite(self.after).all(axis=0)]
-        return float(np.mean(errors < GOAL)) if errors.size else None
-
-    @property
-    def seconds(self) -> float:
-        """Time of all exposures and changes."""
-        return sum(line.seconds + line.change for line in self.lines)
-
-    def document(self) -> dict[str, Any]:
-        """The plan as plain data."""
-        asked = self.criterion
-        document: dict[str, Any] = {
-            "minutes": self.minutes, "seconds": self.seconds,
-            "exposures": [dataclasses.asdict(line) for line in self.lines],
-            "criterion": asked.name, "what": asked.what, "unit": asked.unit, "value": self.value,
-            "bound": self.bound, "gap": self.gap, "gap_of_weights": self.weights_gap,
-            "any_plate": self.any_plate, "truncation": self.truncation, "goal": self.goal,
-            "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
-            "draws": len(self.after), "share_below_goal": self.share, "beside": dict(self.beside),
-            "notes": list(self.notes), "plan": self.observing_plan.document(),
-        }  # fmt: skip
-        if self.criterion.name == criteria.WORST:
-            document |= {"p_error_worst": 0.01 * self.value, "p_error_bound": 0.01 * self.bound}
-        if len(self.x):
-            before, after = np.median(self.before, axis=0), np.median(self.after, axis=0)
-            document["field"] = {
-                "x": self.x.tolist(), "y": self.y.tolist(), "p_error": after.tolist(), "before": before.tolist()
-            }  # fmt: skip
-        return document
-
-    def display(self) -> Display:
-        """The exposures in order, and how good they are."""
-        unit = f" {self.criterion.unit}" if self.criterion.unit else ""
-        better = "above" if self.criterion.inverse else "below"
-        facts = {
-            "time": f"{self.seconds / 60:.1f} of {self.minutes:g} min",
-            self.criterion.what: f"{digits(self.value, '.3g')}{unit}",
-            "proof": f"no plan of this time gets {better} {digits(self.bound, '.3g')}{unit}",
-        }
-        if self.share is not None:
-            seen = np.isfinite(self.after).all(axis=0)
-            without, middle = (100.0 * np.median(errors[:, seen]) for errors in (self.before, self.after))
-            facts["over the field"] = (
-                f"error of p {middle:.3g} % (median over the field; {without:.3g} % without them), below 0.1 % "
-                f"in {100 * self.share:.0f} % of the field where one exposure measures u"
-            )
-        if self.needed is not None:
-            best, least = (f"{digits(minutes, '.3g')} min" for minutes in self.needed)
-            takes = f"{best}, not counting changes; no plan needs less than {least}"
-            facts[f"{digits(self.goal, '.3g')}{unit} takes"] = takes
-        variance_of_plan = self.criterion.variance(self.value)
-        for name, other_value in self.beside.items():
-            factor = self.criterion.variance(other_value) / variance_of_plan
-            variance = "equally good" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"
-            facts[name] = f"{digits(other_value, '.3g')}{unit}; {variance}"
-        return Display(
-            title=f"Plan of {sum(line.times for line in self.lines)} exposures for {self.observing_plan.name}",
-            facts=tuple(facts.items()),
-            head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
-            rows=tuple(line.cells() for line in self.lines),
-            notes=self.notes,
-        )
-
-
-def _angle(angle: float | None) -> str:
-    return "out" if angle is None else f"{angle:.1f}°"
+    later: bool = False
 
 
 def plan_exposures(
@@ -236,6 +103,7 @@ def plan_exposures(
     return plan_from(
         choices, minutes, criteria.criterion_by_name(choices, field, criterion), field,
         known=None if known is None else information_of(known, choices.names, choices.effects),
+        had=() if known is None else (known.exposures,),
         goal=goal, gap=gap, progress=progress,
     )  # fmt: skip
 
@@ -247,11 +115,12 @@ def plan_from(
     field: FieldErrors | None = None,
     *,
     known: Float[np.ndarray, "f f"] | None = None,
+    had: Sequence[Exposures] = (),
     goal: float | None = None,
     gap: float = GAP,
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """As `plan_exposures`, from candidates that are there; `known` is the information of earlier measurements."""
+    """As `plan_exposures`, from candidates that are there; `known` is the information of earlier exposures, `had`."""
     tell = progress or (lambda text: None)
     criteria.check_wishes(minutes, goal)
     shortest = min(choice.seconds + found.available.costs.of(choice.kind) for choice in found.choices)
@@ -272,6 +141,7 @@ def plan_from(
     best, lines, chosen, experiment = _at_few_angles(
         found, weights, lambda part: experiment_of(part, minutes, criterion, known), gap
     )
+    best, lines, required = _for_a_go(chosen, experiment, best, lines, had, gap)
     needed, endless = None, ()
     if goal is not None:
         tell("how long the goal takes")
@@ -282,17 +152,16 @@ def plan_from(
             reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
             endless = (f"{criterion.what}: {reason}; add other settings to the candidates",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
-    stops = (chosen.choices[line.choice].stop(line.place, line.times) for line in lines)
-    spacing = round(minutes / max(sum(line.times for line in lines), 1), 3)
-    plan = with_stops(chosen.available.plan, stops, spacing=spacing)
+    plan = _observed(chosen, lines, minutes)
     none = np.zeros((len(found.values), 0))
     of_both = experiment.known, total
     before, after = (none if field is None else field.error(covariance(m)) for m in of_both)
-    # Earlier measurements may hold what these lack.
-    unseen = () if known is not None else tuple(map(str, about_exposures(plan.exposures())))
+    taken = *had, plan.exposures()
+    lacks = tuple(_lacking(plan, found.model.catalogue, taken, after))
+    open_ends = [str(finding) for finding in about_exposures(*taken)]
     return ExposurePlan(
         minutes=minutes,
-        lines=tuple(_described(chosen, experiment, lines, best)),
+        lines=tuple(_described(chosen, experiment, lines, best, required)),
         criterion=criterion,
         value=criterion.reported(best.value),
         bound=criterion.reported(weights.bound),
@@ -306,9 +175,43 @@ def plan_from(
         after=after,
         beside=dict(_beside(found, problem, criterion)),
         observing_plan=plan,
-        notes=(*found.notes, *endless, *unseen, *chosen.available.doubts(plan)),
+        notes=(*found.notes, *endless, *open_ends, *chosen.available.doubts(plan)),
         any_plate=found.available.any_plate,
+        lacks=lacks,
+        bound_of_go=criterion.reported(best.bound),
+        added=bool(had),
     )
+
+
+def _observed(found: Candidates, lines: Sequence[Line], minutes: float) -> ObservingPlan:
+    """The observing plan of lines of exposures."""
+    stops = [_stop(found.choices[line.choice], line) for line in lines]
+    return with_stops(
+        found.available.plan, stops, spacing=round(minutes / max(sum(line.times for line in lines), 1), 3)
+    )
+
+
+def _stop(choice: CandidateExposure, line: Line) -> Stop:
+    """The stop of a line."""
+    stop = choice.stop(line.place, line.times)
+    if line.later and stop.polariser_angle is not None:
+        stop = dataclasses.replace(stop, polariser_angle=round(stop.polariser_angle + 180.0, 3))
+    return stop
+
+
+def _lacking(
+    plan: ObservingPlan,
+    catalogue: Sequence[EffectKind],
+    taken: Sequence[Exposures],
+    after: Float[np.ndarray, "r p"],
+) -> Iterator[str]:
+    """What a go needs and the exposures of a plan, and of earlier ones, do not give; `after` are the errors of p."""
+    yield from map(str, certify.lacks(plan.design, catalogue, plan.context(), *taken))
+    if after.size:
+        # Where one exposure holds no u the error has no bound.
+        middle = float(np.median(np.nan_to_num(np.median(after, axis=0), nan=np.inf)))
+        if not (need := known_in_half(middle)).met:
+            yield f"p of stars: {need.found}; {need.advice}"
 
 
 Weights = Mapping[tuple[int, tuple[float, ...]], float]  # numbers of exposures, by choice and place
@@ -374,23 +277,57 @@ def _at_few_angles(
     return best
 
 
-def _whole(found: Candidates, experiment: Experiment, weights: Allocation) -> tuple[Allocation, list[Line]]:
-    """Whole exposures in order, within the time with their changes, without settings that are not worth theirs."""
+def _for_a_go(
+    found: Candidates,
+    experiment: Experiment,
+    best: Allocation,
+    lines: list[Line],
+    had: Sequence[Exposures],
+    gap: float,
+) -> tuple[Allocation, list[Line], Weights]:
+    """The plan with what a go needs in it, as far as the time allows: exposures, lines in order, what it had to have.
+
+    Its bound is that of plans with these exposures. A plan that has all of it already stays as it is.
+    """
+    if needs.met(*had, _observed(found, lines, 1.0).exposures()):
+        return best, lines, {}
+    for required in needs.required(found, best.weights, had):
+        information, cost = information_of_weights(experiment, required)
+        known, budget = experiment.known + information, experiment.budget - cost
+        if budget <= 0:
+            continue
+        rest = dataclasses.replace(experiment, known=known, budget=budget)
+        with contextlib.suppress(ValueError):
+            return *_whole(found, rest, optimal.optimise(rest, gap=0.5 * gap), required), required
+    return best, lines, {}
+
+
+def _whole(
+    found: Candidates, experiment: Experiment, weights: Allocation, required: Weights = MappingProxyType({})
+) -> tuple[Allocation, list[Line]]:
+    """Whole exposures in order, within the time with their changes, without settings that are not worth theirs.
+
+    `experiment` is that of the exposures beside those `required`, whose information it has.
+    """
     used = sorted({int(i) for i in weights.family})
     settings = list(dict.fromkeys(found.choices[i].setting for i in used))
-    best = _within(found, experiment, weights, range(len(found.choices)))
+    best = _within(found, experiment, weights, range(len(found.choices)), required)
     for setting in settings if len(settings) > 1 else ():
         remaining = [i for i, choice in enumerate(found.choices) if choice.setting != setting]
         with contextlib.suppress(ValueError):
-            trial = _within(found, experiment, weights, remaining)
+            trial = _within(found, experiment, weights, remaining, required)
             best = min(best, trial, key=lambda pair: pair[0].value)
     return best
 
 
 def _within(
-    found: Candidates, experiment: Experiment, weights: Allocation, allowed: Sequence[int]
+    found: Candidates,
+    experiment: Experiment,
+    weights: Allocation,
+    allowed: Sequence[int],
+    required: Weights = MappingProxyType({}),
 ) -> tuple[Allocation, list[Line]]:
-    """Whole exposures of some choices, with their changes."""
+    """Whole exposures of some choices, and those required, with their changes."""
     at = [i for i, family in enumerate(weights.family) if family in allowed]
     if not at:
         raise ValueError("none of the best exposures is left")
@@ -408,23 +345,40 @@ def _within(
         scaled = dataclasses.replace(weights, family=family, place=place, weight=weight)
         integer = optimal.rounded(problem, scaled)
         integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
-        lines = _ordered(found, integer)
+        both = _together(integer, required)
+        lines = _ordered(found, both.weights)
         between = sum(_changes(found, lines))
         if _cost(experiment, integer.weights) + between <= budget * (1 + 1e-9):
-            return integer, lines
+            return both, lines
         changes = max(between, changes + 1.0)
     raise ValueError(f"{budget / 60:g} minutes do not pay for the changes between exposures; give more time")
 
 
-def _ordered(found: Candidates, plan: Allocation) -> list[Line]:
+def _together(plan: Allocation, required: Weights) -> Allocation:
+    """A plan with the exposures that are required beside it; its value has them already."""
+    weights = dict(plan.weights)
+    for at, times in required.items():
+        weights[at] = weights.get(at, 0.0) + times
+    place = [np.array(at) for _, at in weights]
+    return dataclasses.replace(
+        plan,
+        family=np.array([i for i, _ in weights], int),
+        place=place,
+        weight=np.array(list(weights.values())),
+    )
+
+
+def _ordered(found: Candidates, planned: Weights) -> list[Line]:
     """Indoors setting by setting, the polariser turning one way; then the sky, last setting first, the nearest next."""
-    lines = [Line(*at, int(times)) for at, times in plan.weights.items()]
+    later = needs.half_a_turn_later(found, planned)
+    lines = [Line(*at, int(times), at in later) for at, times in planned.items()]
     settings = list(dict.fromkeys(found.choices[i].setting for i in sorted({line.choice for line in lines})))
 
     def key(line: Line) -> tuple[int, int, float]:
         choice = found.choices[line.choice]
         number = settings.index(choice.setting)
-        return (0, number, line.place[0]) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
+        along = line.place[0] + 2.0 * np.pi * line.later
+        return (0, number, along) if choice.kind in ("clp", "lamp") else (1, -number, 0.0)
 
     lines.sort(key=key)
     done, sky = ([line for line in lines if key(line)[0] == place] for place in (0, 1))
@@ -479,13 +433,13 @@ def largest_variance(experiment: Experiment, total: Float[np.ndarray, "r n n"]) 
 
 
 def _described(
-    found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation
+    found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation, required: Weights
 ) -> Iterator[PlannedExposure]:
     keys = list(best.weights)
     without, added = optimal.worth(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, i = found.choices[line.choice], keys.index((line.choice, line.place))
-        stop = choice.stop(line.place)
+        stop = _stop(choice, line)
         yield PlannedExposure(
             *(choice.kind, choice.filter, choice.positions),
             polariser_angle=float("nan") if stop.polariser_angle is None else stop.polariser_angle,
@@ -497,6 +451,7 @@ def _described(
             exptime=choice.seconds,
             change=change,
             place=stop.place,
+            needed=(line.choice, line.place) in required,
         )
 
 

@@ -40,6 +40,7 @@ from walop_jax.science.field_accuracy import FieldAccuracy
 GENERATOR = '<meta name="generator" content="walop-jax'  # of every page
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
+_NAMED = 3  # patterns in a sentence
 MANY = 32  # rows of a table above which it is folded
 SMALL = ("ladder", "protection")  # figures that take half of the width
 
@@ -389,7 +390,12 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
         steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {other}"))
     if run.limits is None and trusted:
         steps.append(("list mistakes that these data would not show", f"walop-jax limits {sets} -o {name}"))
-    if run.product is None or run.product.maps.arms == 2:
+    left = {} if run.diagnosis is None else run.diagnosis["unexplained"]
+    if left:
+        # Further exposures of the same kind show an unknown effect again: they do not name it.
+        seen = ", ".join(row["pattern"] for row in left.get("patterns", ())[:_NAMED]) or "what is left"
+        steps.append((f"say what makes {seen}", f"walop-jax diagnose {sets} --effects OWN.toml -o {other}"))
+    elif run.product is None or run.product.maps.arms == 2:
         steps.append(("plan better exposures", f"walop-jax plan {name} --minutes 10"))
     return steps  # with other arms it is for the user to say which error is to be small
 

@@ -25,6 +25,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarFormatter
+from scipy.spatial import KDTree
 
 from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
 from walop_jax.io.text import with_minus_sign
@@ -250,14 +251,17 @@ def point_map(
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
 ) -> Any:
-    """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges."""
+    """A square tile for each point with a value, as wide as neighbours are apart; `shown` set distance and edges.
+
+    Where points of another raster lie between them tiles are smaller: no two overlap.
+    """
     shown = np.ones(len(x), bool) if shown is None else shown
-    size = _spacing(x[shown], y[shown])
     visible = shown & np.isfinite(values)
-    corners = zip(x[visible] - 0.5 * size, y[visible] - 0.5 * size, strict=True)
+    size = np.minimum(_spacing(x[shown], y[shown]), nearest_apart(x[visible], y[visible]))
+    corners = zip(x[visible] - 0.5 * size, y[visible] - 0.5 * size, size, strict=True)
     # Edges in the colour of the tile close the seams that viewers leave between neighbours.
     tiles = PatchCollection(
-        [Rectangle(corner, size, size) for corner in corners],
+        [Rectangle((left, below), side, side) for left, below, side in corners],
         cmap=colours, norm=norm, edgecolor="face", linewidth=0.3,
     )  # fmt: skip
     tiles.set_array(values[visible])
@@ -272,6 +276,18 @@ def error_map(axis: Axes, title: str, x: Places, y: Places, percent: Places, nor
     blind = np.isnan(percent)
     axis.plot(x[blind], y[blind], "x", color="0.5", ms=4, label="u not measured in one exposure")
     return point_map(axis, title, x, y, percent, norm, SEQUENTIAL)
+
+
+def nearest_apart(x: Places, y: Places) -> Places:
+    """Distance of each point from the next at another place, the larger of those along X and Y.
+
+    Squares with these sides do not overlap. Infinite for a point that is alone.
+    """
+    places, number = np.unique(np.stack([x, y], axis=1), axis=0, return_inverse=True)
+    if len(places) < 2:
+        return np.full(len(x), np.inf)
+    distance, _ = KDTree(places).query(places, k=2, p=np.inf)
+    return np.asarray(distance)[:, 1][number.ravel()]
 
 
 def _spacing(x: Places, y: Places) -> float:

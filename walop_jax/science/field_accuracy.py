@@ -117,11 +117,7 @@ class FieldAccuracy:
     @property
     def middle(self) -> Requirement:
         """The requirement of a go on p: that it is known in half of the field."""
-        cause, allowed = self.limited_by.split(" (")[0], self.goal / 2
-        light = two_digits((self.median / allowed) ** 2)
-        source = f" (most of the error comes from {cause})" if cause else ""
-        advice = f"{light} times the light{source}, over several nights: walop-jax stack, walop-jax plan"
-        return _p_known(self.median, allowed, "50 % of the field", advice)
+        return known_in_half(self.median, self.goal, self.limited_by.split(" (")[0])
 
     @property
     def shortfalls(self) -> tuple[Requirement, ...]:
@@ -190,6 +186,19 @@ def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: b
     found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
     # An error that is NaN is not known.
     return Requirement(f"p known to {limit} in {where}", error <= allowed, found, advice, needed)
+
+
+def known_in_half(error: float, goal: float = GOAL, cause: str = "") -> Requirement:
+    """The requirement of a go on p; `error` is the median over the field, `cause` what most of it comes from."""
+    allowed = goal / 2
+    light = two_digits((error / allowed) ** 2)  # errors fall with its square root
+    source = f" (most of the error comes from {cause})" if cause else ""
+    advice = f"{light} times the light{source}, over several nights: walop-jax stack, walop-jax plan"
+    if not np.isfinite(error):
+        advice = (
+            "observe with the calibration plate at 22.5° as well: elsewhere one exposure does not measure u"
+        )
+    return _p_known(error, allowed, "50 % of the field", advice)
 
 
 def answered(result: FitResult, goal: float = GOAL) -> FitResult:

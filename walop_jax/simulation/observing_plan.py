@@ -54,8 +54,39 @@ NO_SKY: Mapping[str, Any] = {"moon_patches": 0, "standards": 0, "unpolarised": 0
 
 
 def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, ...]:
-    """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one."""
+    """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one.
+
+    Light behind the polariser is the same half a turn later: of a full turn an odd `count` has so many directions, an
+    even one half as many, each twice.
+    """
     return tuple(float(a) for a in np.arange(count) * ((360.0 if full_turn else 180.0) / count))
+
+
+_USUAL_ANGLES = polariser_turn()
+
+
+def _angles_of(given: Any, full_turn: Any) -> tuple[float, ...]:
+    """The angles (deg) of the polariser that a plan, in Python or as a file, gives: a list, or the number of them.
+
+    Raises ValueError for what is neither, and for `full_turn` beside a list.
+    """
+    if not isinstance(full_turn, bool | None):
+        raise ValueError(f"full_turn = {full_turn!r} must be true or false")
+    if given is _USUAL_ANGLES and full_turn is not None:
+        given = len(_USUAL_ANGLES)
+    if isinstance(given, int | np.integer) and not isinstance(given, bool):
+        if given < 1:
+            raise ValueError(f"polariser_angles = {given} must be at least 1, or a list of angles (deg)")
+        return polariser_turn(int(given), full_turn=bool(full_turn))
+    listed = np.ndim(given) == 1
+    if listed and full_turn is not None:
+        what = "is of no use beside a list of angles; give their number, or leave it out"
+        raise ValueError(f"full_turn {what}")
+    angles = np.asarray(given, float) if listed else np.array(np.nan)
+    if not np.isfinite(angles).all():
+        what = "must be a number of angles, such as 15, or a list of them (deg)"
+        raise ValueError(f"polariser_angles = {given!r} {what}")
+    return tuple(given) if isinstance(given, tuple) else tuple(angles.tolist())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +141,8 @@ class ObservingPlan:
     `standard_grid` × `standard_grid` places of the standards out to 4/5 of it; where the instrument's raster is a line
     the points are `grid` steps of X from 0 to `field` (the tilts of a plate on a bench). NaN: as far out as its
     description says.
-    The polariser goes through `polariser_angles` (deg) for each of `filters` and each setting of the calibration
+    The polariser goes through `polariser_angles` (deg; a number: so many, evenly over half a turn, with `full_turn`
+    over a full one) for each of `filters` and each setting of the calibration
     plate in `plate` (deg, None: out); Moon patches and standards take the settings in turn, in the first filter.
     `filters` are names of those that are built in, and `FilterCurve`s; also a dict of curves by name. The Moon is
     observed from `mjd` (UTC) on, at `separations` (deg), the polariser before and the standards after; exposures are
@@ -138,7 +170,7 @@ class ObservingPlan:
     grid: int = 12
     field: float = NAN
     standard_grid: int = 5
-    polariser_angles: tuple[float, ...] = polariser_turn()
+    polariser_angles: Sequence[float] | Float[np.ndarray, " a"] | int = _USUAL_ANGLES
     moon_patches: int = 8
     separations: tuple[float, float] = (8.0, 20.0)
     standards: int = 8
@@ -163,6 +195,7 @@ class ObservingPlan:
     stops: tuple[Stop, ...] = ()
     patches: tuple[int, ...] | None = None
     stars: tuple[int, ...] | None = None
+    full_turn: dataclasses.InitVar[bool | None] = None
 
     def __repr__(self) -> str:
         text = (
@@ -172,7 +205,8 @@ class ObservingPlan:
         )
         return f"ObservingPlan({', '.join([repr(self.name), *text])})"
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, full_turn: bool | None) -> None:
+        object.__setattr__(self, "polariser_angles", _angles_of(self.polariser_angles, full_turn))
         if isinstance(self.instrument, str):
             described(self.instrument)  # an unknown name is an error here
         if np.isnan(self.field):
@@ -203,7 +237,7 @@ class ObservingPlan:
         if self.design.polariser is not None:
             if not self.polariser_angles:
                 raise ValueError("at least one polariser angle is needed")
-        elif self.polariser_angles != polariser_turn():
+        elif self.polariser_angles != _USUAL_ANGLES:
             raise ValueError(f"polariser_angles: {self.name} has no polariser")
         elif not (self.lamps or self.stops or self.moon_patches or self.standards):
             raise ValueError("no exposures: give lamps, Moon patches or standards")
@@ -324,7 +358,7 @@ class ObservingPlan:
     def _taken(self) -> tuple[Stop, ...]:
         """Every exposure, in the order in which they are taken."""
         further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
-        of_polariser = () if self.design.polariser is None else self.polariser_angles
+        of_polariser: Any = () if self.design.polariser is None else self.polariser_angles
         angles = (*of_polariser, *[None] * self.lamps)
         indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
@@ -477,9 +511,6 @@ def _curve_document(given: str | FilterCurve) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------------------- plans as files
 
-_ANGLES = len(polariser_turn())
-FULL_TURN = "full_turn"
-
 
 def is_plan(path: PathLike) -> bool:
     """True for a file that is a plan by its name."""
@@ -501,19 +532,14 @@ def plan_of(
     """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
     content = dict(content)
     hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
-    check_names("entry of a plan", content, (*hints, FULL_TURN))
+    check_names("entry of a plan", content, hints)
+    angles, full_turn = content.get("polariser_angles", _USUAL_ANGLES), content.pop("full_turn", None)
+    if full_turn is not None or not isinstance(angles, list | tuple):
+        content["polariser_angles"] = list(_angles_of(angles, full_turn))
+    hints["polariser_angles"] = tuple[float, ...]
     named = instrument_named(content, folder)
     content.pop("instrument", None)
     instrument = named if instrument is None else instrument
-    full_turn, angles = content.pop(FULL_TURN, None), content.get("polariser_angles", _ANGLES)
-    if isinstance(angles, int):
-        if angles < 1:
-            raise ValueError(f"polariser_angles = {angles} must be at least 1, or a list of angles (deg)")
-        content["polariser_angles"] = polariser_turn(angles, full_turn=bool(full_turn))
-    elif full_turn is not None:
-        raise ValueError(
-            f"{FULL_TURN} is of no use beside a list of angles; give their number, or leave it out"
-        )
     stops, filters = content.pop("stops", []), content.pop("filters", None)
     values = read.values(hints, content, "")
     if filters is not None:

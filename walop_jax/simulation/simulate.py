@@ -282,7 +282,10 @@ def true_instrument(
 
 
 def as_planned(plan: ObservingPlan) -> CalibrationSet:
-    """The set that the instrument as designed would give, without noise: for judging a plan."""
+    """The set that the instrument as designed would give in steady weather, without noise: the layout of a plan.
+
+    What a plan will show depends on the instrument as built, and on the weather: `diagnosis.planned_limits`.
+    """
     return simulate(plan, instrument=plan.design, noiseless=True, steady=True).calset
 
 
