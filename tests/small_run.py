@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+from walop_jax.data.records import StatedErrors
 from walop_jax.fit.refit import FitResult, refit
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -20,6 +22,14 @@ SEED = 4
 def small_fit() -> FitResult:
     """The fit of a small run, made once, with the verdict on χ² and priors alone."""
     return refit(simulate(SMALL, seed=SEED).calset).judged()
+
+
+@functools.cache
+def small_fit_stating(**errors: float) -> FitResult:
+    """The fit of the small run, whose set states other errors of its numbers (`StatedErrors`)."""
+    fit = small_fit()
+    calset = dataclasses.replace(fit.calset, stated_errors=StatedErrors(**errors))
+    return dataclasses.replace(fit, likelihood=Likelihood.of(calset, fit.model))
 
 
 @functools.cache

@@ -182,6 +182,17 @@ def test_columns_of_a_calibration_set():
         assert told == expected, name
 
 
+def test_errors_of_the_numbers_of_a_set():
+    """Every word with its name in Python, its unit and its usual size, and none besides."""
+    from walop_jax.data.records import ERROR_WORDS
+
+    told = {tuple(row) for row in rows(section("files", "Errors of the numbers of a set"))}
+    assert told == {
+        (word, f"`{name}`", unit, f"{usual:g}", about)
+        for name, (word, unit, usual, about) in ERROR_WORDS.items()
+    }
+
+
 def test_kinds_and_flags():
     from walop_jax.data.kinds import KINDS
     from walop_jax.data.records import DataFlag

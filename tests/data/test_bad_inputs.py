@@ -82,6 +82,12 @@ BAD = {
     "Moon, no site": (header("SITELONG", None), "[PRIMARY] SITELONG: is nan", "site"),
     "latitude": (header("SITELAT", -132.0), "SITELAT: is -132, not in -90 … 90"),
     "latitude, no Moon": (no_moon("SITELAT", -132.0), "SITELAT: is -132, not in -90 … 90"),
+    "error of positions": (header("POS_ERR", -1.0), "[PRIMARY] POS_ERR: is -1.0", "in arcsec, 0 or more"),
+    "error of positions, text": (
+        header("POS_ERR", "1 arcsec"),
+        "[PRIMARY] POS_ERR: is '1 arcsec'",
+        "a number",
+    ),
     # tables as such
     "no table": (remove(P), "[POINTS]: the extension is missing"),
     "no exposures": (empty(E), "[EXPOSURES]: has no rows"),

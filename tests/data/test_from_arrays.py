@@ -91,6 +91,18 @@ def test_the_record_of_the_frames_that_a_set_stands_for_comes_back():
     assert from_arrays(**summed.to_arrays()).compression == record
 
 
+def test_errors_of_the_numbers_of_a_set_come_back():
+    calset = made(stated_errors={"position": 0.2, "time": 30})
+    assert (calset.stated_errors.position, calset.stated_errors.time) == (0.2, 30)
+    assert calset.stated_errors.scale == made().stated_errors.scale == 1e-3
+    assert made().stated_errors.position == 1.0
+    assert from_arrays(**calset.to_arrays()).stated_errors == calset.stated_errors
+    with pytest.raises(ValueError, match=r"none of 'postion'; did you mean 'position'"):
+        made(stated_errors={"postion": 0.2})
+    with pytest.raises(ValueError, match=r"time = -1, the error of MJD of sky exposures"):
+        made(stated_errors={"time": -1.0})
+
+
 def test_a_turn_is_an_angle_in_a_table_too():
     table = made(chwp_in=True, chwp_angle=10.0, chwp_turn=np.deg2rad(30.0) * units.rad).to_table()
     assert {table[name].unit for name in ("CHWP_TURN", "CHWP_ANGLE", "CLP_ANGLE", "RA")} == {units.deg}

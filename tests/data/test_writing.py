@@ -56,6 +56,26 @@ def test_round_trip_is_exact(handmade):
     assert path.read_bytes() == second.read_bytes()
 
 
+def test_errors_of_the_numbers_of_a_set_are_read_written_and_joined(handmade):
+    """Of several files the largest of each."""
+    handmade.header |= {"POS_ERR": 0.5, "SCAL_ERR": 2e-3, "MJD_ERR": 0}
+    one = read_calibration_set(handmade.write("one.fits"))
+    assert (one.stated_errors.position, one.stated_errors.scale, one.stated_errors.time) == (0.5, 2e-3, 0.0)
+    again = handmade.folder / "again.fits"
+    write_calibration_set(again, one)
+    assert read_calibration_set(again).stated_errors == one.stated_errors
+    assert {name: fits.getval(again, name) for name in ("POS_ERR", "SCAL_ERR", "MJD_ERR")} == {
+        "POS_ERR": 0.5,
+        "SCAL_ERR": 2e-3,
+        "MJD_ERR": 0,
+    }
+    other = handmade.copy()
+    other.header |= {"POS_ERR": 3.0, "SCAL_ERR": 1e-4, "MJD_ERR": 2.0}
+    both = merge_calibration_sets(one, read_calibration_set(other.write("two.fits"))).stated_errors
+    assert (both.position, both.scale, both.time) == (3.0, 2e-3, 2.0)
+    assert both.rotator == 0.1  # the usual one
+
+
 def test_the_level_of_the_sky_is_read_written_and_joined(handmade):
     rows = len(handmade.values("INTENSITIES", "N"))
     sky = np.arange(4.0 * rows).reshape(rows, 4)

@@ -12,7 +12,7 @@ import pytest
 from changed_sets import block_of, with_block
 from quick import quick
 from scipy import stats
-from small_run import SEED, SMALL, small_fit, small_fit_with_plate
+from small_run import SEED, SMALL, small_fit, small_fit_stating, small_fit_with_plate
 
 from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
@@ -355,11 +355,24 @@ def test_at_its_limit_a_number_is_found_as_often_as_promised():
     assert checked >= 5
 
 
+def test_a_limit_beyond_what_is_plausible_is_told_beside_the_error_of_the_plausible():
+    """The limit is that of the data; q and u are off by no more than the error that the set states makes."""
+    limits = {}
+    for position in (1.0, 2.0, 3600.0):
+        found = condition_limits(Design.of(small_fit_stating(position=position)))
+        limits[position] = next(one for one in found if one.what.startswith("X of all"))
+    assert limits[1.0].detected == limits[2.0].detected == limits[3600.0].detected == limits[3600.0].size
+    assert (limits[1.0].size, limits[2.0].size) == pytest.approx((1 / 3600, 2 / 3600))
+    twice = 2.0 * limits[1.0].error_of_qu[0]  # so small a mistake is linear
+    assert limits[2.0].error_of_qu[0] == pytest.approx(twice, rel=0.01)
+
+
 def test_the_error_at_the_limit_is_that_of_a_fit_that_is_misled():
     """q and u off by as much as the matrix of a fit to noiseless counts with X wrong by its limit, to a fifth."""
     right = small_fit()
     calset = right.calset
-    limit = next(one for one in condition_limits(Design.of(right)) if one.what.startswith("Y of all"))
+    limits = condition_limits(Design.of(small_fit_stating(position=3600.0)))
+    limit = next(one for one in limits if one.what.startswith("Y of all"))
     misled = refit(moved(calset, calset.points.x, calset.points.y + limit.detected), right.model)
 
     def matrix(result: FitResult) -> np.ndarray:

@@ -8,7 +8,8 @@ import functools
 import numpy as np
 import pytest
 from astropy.table import Table
-from small_run import SEED, SMALL, small_fit
+from scipy import optimize, stats
+from small_run import SEED, SMALL, small_fit, small_fit_stating
 from star_tables import SOUTH, setting
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
@@ -16,6 +17,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.could_hide import change_by_effect, could_hide
 from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.data.records import ERROR_WORDS
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hidden_mistakes import _Starlight, hidden_mistakes
@@ -130,6 +132,72 @@ def test_what_moon_and_standards_measure_is_measured():
     assert all(mistake.measured for mistake in hidden.mistakes)
     found = could_hide(dataclasses.replace(Calibration.from_fit(small_fit()), hidden=hidden))
     assert [one.error[0] for one in found] == sorted((one.error[0] for one in found), reverse=True)
+
+
+def found_with_99_per_cent(tried: int) -> float:
+    """Noncentrality of χ² of one degree of freedom that undercuts a p of 0.0027 of so many in 99 of 100 cases."""
+    threshold = stats.chi2.isf(1.0 - (1.0 - 0.0027) ** (1.0 / tried), 1)
+    return float(optimize.brentq(lambda square: stats.ncx2.sf(threshold, 1, square) - 0.99, 1.0, 200.0))
+
+
+@functools.cache
+def singles_of(**errors: float) -> tuple[Design, Singles]:
+    """Design of the small run whose set states such errors, and its single numbers."""
+    design = Design.of(small_fit_stating(**errors))
+    return design, Singles.of(design)
+
+
+NUMBERS = {
+    "X of all field points": ("position", 1.0 / 3600.0),
+    "the scale of X and Y": ("scale", 1.0),
+    "scattered light in O1": ("scattered", 1.0),
+    "TEFF of exposures of kind clp": ("teff", 5772.0),
+}
+"""Some numbers of the small set: the field of `StatedErrors`, and its unit in that of the number."""
+COARSE = {"position": 3600.0, "scale": 0.5, "scattered": 0.5, "teff": 1.0}
+FINE = {"position": 15.0, "scale": 0.01, "scattered": 1e-3, "teff": 0.5}
+
+
+@pytest.mark.parametrize("errors", [COARSE, FINE])
+def test_what_hides_is_what_the_data_do_not_show_and_is_plausible(errors):
+    """h = min(w, √λ s): w the error that the set states, s the error with which its data measure the number."""
+    design, singles = singles_of(**errors)
+    mistakes = {one.name: one for one in hidden_mistakes(design, singles).mistakes}
+    found, least = list[str](), np.sqrt(found_with_99_per_cent(len(singles.testable)))
+    for item in singles.items:
+        name = item.single.candidate.name
+        if name in NUMBERS and name in mistakes:
+            field, unit = NUMBERS[name]
+            s = np.sqrt(item.score.covariance[0, 0]) / singles.noise_scale
+            assert mistakes[name].size == pytest.approx(min(errors[field] * unit, least * s), rel=1e-6), name
+            found.append(name if least * s < errors[field] * unit else "")
+    # The data of the coarse set limit, of the fine one what it states.
+    assert found.count("") == (0 if errors is COARSE else len(found))
+    assert len(found) > 1
+
+
+def test_positions_of_an_arcsecond_hide_no_more_than_that():
+    """A fiftieth of what the data would show, and as small in q and u; the search is the same."""
+    product = Calibration.from_fit(small_fit())
+
+    def by_positions(**errors: float) -> float:
+        hidden = hidden_mistakes(*singles_of(**errors))
+        found = could_hide(dataclasses.replace(product, hidden=hidden))
+        places = ("X of all", "Y of all", "the scale of", "the angle of the field")
+        return max((one.error[0] for one in found if one.name.startswith(places)), default=0.0)
+
+    assert by_positions(**COARSE) > 1e-3
+    assert by_positions() < 2e-4
+    scores = ({one.score.name: one.score.log_p for one in singles_of(**e)[1].items} for e in (COARSE, {}))
+    assert next(scores) == next(scores)
+
+
+def test_a_number_that_is_known_exactly_hides_nothing():
+    exactly = dict.fromkeys(ERROR_WORDS, 0.0)
+    hidden = hidden_mistakes(*singles_of(**exactly))
+    of_data = [one.name for one in hidden.mistakes if one.kind == "data"]
+    # Who takes coordinates of date for ICRS is wrong by the years since 2000, however well they are measured.
+    assert set(of_data) <= {"the equinox of RA and DEC"}
 
 
 @pytest.mark.parametrize("name", ["telescope_polarisation", "hwp1_axis", "camera_leakage", "hwp2_crossing"])

@@ -59,7 +59,7 @@ class CouldHide(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Name, and the size at which it would just be detected, or the usual one of an unmeasured mistake."""
+        """Name and size: that at which it would just be detected, or its standard error where that is smaller."""
         size, unit = (self.size, self.unit) if self.unit else (100 * self.size, "%")
         what = "an error of" if self.measured else "not measured; usual size"
         return f"{self.name} ({what} {rounded(size, '.2g')} {unit})"

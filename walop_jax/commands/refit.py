@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
-@command(
-    stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True, outputs=("output", "compress")
-)
+@command(stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True, outputs=("output", "compress"))
 def refit(
     job: Job,
     data: Sets,

@@ -17,6 +17,7 @@ from walop_jax.data.hdus import filter_columns
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
+    ERROR_WORDS,
     CalibrationSet,
     Compression,
     Exposures,
@@ -26,6 +27,7 @@ from walop_jax.data.records import (
     Points,
     Site,
     Sources,
+    StatedErrors,
 )
 from walop_jax.data.repeats import mask_repeats, repeated_counts
 from walop_jax.data.settings import builtin_filter
@@ -109,6 +111,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         remarks=remarks,
         images=images,
         compression=None if EXTENSION not in hdus else read_compression(hdus[EXTENSION], path),
+        stated_errors=_stated_errors(primary, path),
     )
 
 
@@ -123,6 +126,7 @@ def assembled(
     remarks: Iterable[str] = (),
     images: Mapping[str, Any] | None = None,
     compression: Compression | None = None,
+    stated_errors: StatedErrors | None = None,
 ) -> CalibrationSet:
     """A checked calibration set from its tables, columns by name in kind and unit of the schema.
 
@@ -168,6 +172,7 @@ def assembled(
         intensities=intensities,
         remarks=tuple(remarks),
         compression=compression,
+        stated_errors=stated_errors or StatedErrors(),
     )
 
 
@@ -204,6 +209,20 @@ def _in_icrs(table: dict[str, Any], headers: Iterable[Any], place: Place) -> lis
             what = f"are in {frame.system if frame.system == 'GAPPT' else frame}: converted to ICRS"
             return [] if frame.is_icrs else [place.remark(what, "RA, DEC")]
     return []
+
+
+def _stated_errors(header: Any, path: Path) -> StatedErrors:
+    """The errors of the numbers of a set, as its primary header gives them."""
+    place, stated = Place(path, "PRIMARY"), dict[str, float]()
+    for name, (word, unit, _, about) in ERROR_WORDS.items():
+        value = header.get(word)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < np.inf:
+            wanted = f"the error of {about}: a number{f' in {unit}' if unit else ''}, 0 or more"
+            raise place.fail(f"is {value!r}", word, wanted)
+        stated[name] = float(value)
+    return StatedErrors(**stated)
 
 
 def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -285,6 +304,7 @@ def from_arrays(
     sky: Any = None,
     origin: str = "",
     compression: Compression | None = None,
+    stated_errors: Mapping[str, float] | None = None,
     **exposures: Any,
 ) -> CalibrationSet:
     """A checked calibration set from arrays in memory.
@@ -297,7 +317,8 @@ def from_arrays(
     `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
     columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `sky` the level of the
     sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name; `compression` is that
-    of a set that stands for whole frames. Quantities are converted.
+    of a set that stands for whole frames; `stated_errors` are those of the numbers of the set that differ from the
+    usual ones, such as `{"position": 0.2, "scale": 1e-4}` (docs: files). Quantities are converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
 
@@ -351,12 +372,14 @@ def from_arrays(
         tables["FILTERS"] = filter_columns(filters)
     site = site or Site("", _NAN, _NAN, _NAN)
     calset = _in_memory(tables, instrument=instrument, site=site, origin=origin, compression=compression)
-    return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)))
+    stated = StatedErrors.of(stated_errors or {})
+    return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)), stated_errors=stated)
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
     """A set from memory behind the checks that files meet; unusable rows are masked, and remarked on."""
-    header = {name: getattr(calset, name) for name in ("instrument", "site", "origin", "compression")}
+    names = "instrument", "site", "origin", "compression", "stated_errors"
+    header = {name: getattr(calset, name) for name in names}
     found = _in_memory(set_tables(calset), **header, kinds=(*KINDS, *kinds))
     before, after = calset.intensities, found.intensities
     if isinstance(before, TableIntensities) and isinstance(after, TableIntensities):

@@ -21,6 +21,7 @@ from walop_jax.data.records import (
     Points,
     Position,
     Sources,
+    StatedErrors,
 )
 from walop_jax.data.repeats import mask_repeats, repeated_counts
 from walop_jax.data.table_intensities import TableIntensities, empty_block
@@ -98,7 +99,8 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     Exposure and point identifiers that collide are renumbered (and this is remarked on); points of tables
     with identical coordinates become one, sources with the same name likewise. Frames on the same
     grid share their pixels; frames and tables keep field points of their own. A moving element that a set does
-    not have is out there. The record of a set that stands for pixels goes with its exposures.
+    not have is out there. The record of a set that stands for pixels goes with its exposures. Of the errors of the
+    numbers of the sets the largest are taken.
 
     Raises `DataError` for different instruments, numbers of cameras or sites, for a filter or source that has
     one name and two meanings, and for a set that stands for pixels beside another one, or beside frames.
@@ -132,6 +134,7 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         inputs=tuple(entry_input for entry in sets for entry_input in entry.inputs),
         remarks=tuple(dict.fromkeys([remark for entry in sets for remark in entry.remarks] + remarks)),
         compression=compression,
+        stated_errors=StatedErrors.largest(entry.stated_errors for entry in sets),
     )
 
 

@@ -7,7 +7,7 @@ import enum
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -48,6 +48,103 @@ class Site:
     def known(self) -> bool:
         """True if all three numbers are finite."""
         return bool(np.isfinite([self.latitude, self.longitude, self.elevation]).all())
+
+
+class ErrorWord(NamedTuple):
+    """One number of `StatedErrors`: its word in a primary header, its unit, its usual size, what it is the error of."""
+
+    word: str
+    unit: str
+    usual: float
+    about: str
+
+
+ERROR_WORDS: Mapping[str, ErrorWord] = {
+    "position": ErrorWord("POS_ERR", "arcsec", 1.0, "X and of Y, common to all field points"),
+    "scale": ErrorWord("SCAL_ERR", "", 1e-3, "the scale of X and Y, a share"),
+    "turn": ErrorWord("TURN_ERR", "rad", 1e-3, "the angle by which the field is turned"),
+    "wavelength": ErrorWord(
+        "WAVE_ERR", "um", 3e-3, "the wavelengths of a filter curve, common to all of them"
+    ),
+    "teff": ErrorWord("TEFF_ERR", "", 0.05, "TEFF, a share, common to all exposures of a KIND"),
+    "pointing": ErrorWord("RA_ERR", "arcsec", 60.0, "RA and of DEC of sky exposures, common to all of them"),
+    "time": ErrorWord("MJD_ERR", "s", 1.0, "MJD of sky exposures, common to all of them"),
+    "site": ErrorWord("SITE_ERR", "deg", 0.01, "SITELAT and of SITELONG"),
+    "rotator": ErrorWord("ROT_ERR", "deg", 0.1, "ROTATOR, common to all exposures of a KIND"),
+    "sky": ErrorWord("SKY_ERR", "", 0.02, "SKY, a share, common to all intensities"),
+    "linearity": ErrorWord(
+        "LIN_ERR", "", 0.02, "N of one camera, a share at 10⁶ electrons that grows with N"
+    ),
+    "scattered": ErrorWord(
+        "SCAT_ERR", "", 3e-3, "N of one camera, a share of its median counts in every exposure"
+    ),
+    "pedestal": ErrorWord(
+        "BIAS_ERR", "", 3e-3, "N of one camera, a share of the usual counts, the same everywhere"
+    ),
+    "leakage": ErrorWord("LEAK_ERR", "", 0.02, "N of one camera, a share of the light of another camera"),
+}
+"""The words of a primary header by the fields of `StatedErrors`."""
+
+
+def _usual(name: str) -> Any:
+    return dataclasses.field(default=ERROR_WORDS[name].usual)
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedErrors:
+    """Standard errors of the numbers that a set states, each of a mistake that all of them have in common.
+
+    They say which mistakes to reckon with where the data would not show them. The search for a mistake is not limited
+    by them: one that is far larger is found all the same. Units and usual sizes are those of `ERROR_WORDS`: what is
+    left of an astrometric solution, of the clock of a computer, of a measured filter curve. 0: known exactly.
+
+    Raises ValueError for a number that is no error.
+    """
+
+    position: float = _usual("position")
+    scale: float = _usual("scale")
+    turn: float = _usual("turn")
+    wavelength: float = _usual("wavelength")
+    teff: float = _usual("teff")
+    pointing: float = _usual("pointing")
+    time: float = _usual("time")
+    site: float = _usual("site")
+    rotator: float = _usual("rotator")
+    sky: float = _usual("sky")
+    linearity: float = _usual("linearity")
+    scattered: float = _usual("scattered")
+    pedestal: float = _usual("pedestal")
+    leakage: float = _usual("leakage")
+
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if not (np.isfinite(value) and value >= 0.0):
+                word = ERROR_WORDS[name]
+                what = f"stated_errors: {name} = {value:g}, the error of {word.about}, is to be 0 or more"
+                raise ValueError(f"{what}{f', in {word.unit}' if word.unit else ''}")
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name}={value:g}" for name, value in self.stated.items())
+        return f"{type(self).__name__}({told})"
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Those that differ from the usual ones."""
+        return {n: v for n, v in dataclasses.asdict(self).items() if v != ERROR_WORDS[n].usual}
+
+    @classmethod
+    def of(cls, given: Mapping[str, float]) -> StatedErrors:
+        """The usual errors, some of them given; ValueError, with the nearest names, for one that there is not."""
+        for name in given:
+            if name not in ERROR_WORDS:
+                raise ValueError(f"stated_errors: there is none of {name!r}; {nearest(name, ERROR_WORDS)}")
+        return cls(**given)
+
+    @classmethod
+    def largest(cls, given: Iterable[StatedErrors]) -> StatedErrors:
+        """Of each number the largest error."""
+        columns = zip(*(dataclasses.astuple(entry) for entry in given), strict=True)
+        return cls(*map(max, columns))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,7 +418,7 @@ class CalibrationSet(Displayed):
     """A calibration set, read, checked and free of units.
 
     `intensities` gives the data of a slice of the points; whole frames are read from disk only then. `compression` is
-    there where the field points stand for the pixels of frames.
+    there where the field points stand for the pixels of frames. `stated_errors` are those of the numbers of the set.
 
     >>> calset.instrument, len(calset.exposures), len(calset.points)
     ('WALOP-SOUTH', 14, 29)
@@ -338,6 +435,7 @@ class CalibrationSet(Displayed):
     inputs: tuple[InputFile, ...] = ()
     remarks: tuple[str, ...] = ()
     compression: Compression | None = None
+    stated_errors: StatedErrors = StatedErrors()
 
     @property
     def cameras(self) -> int:
@@ -393,6 +491,7 @@ class CalibrationSet(Displayed):
             "sources": stars if len(self.sources) else None,
             "origin": self.origin,
             "compression": self.compression,
+            "stated_errors": self.stated_errors.stated,
         }
 
     def to_table(self) -> Any:

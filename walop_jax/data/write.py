@@ -16,7 +16,7 @@ from astropy.io import fits
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name
 from walop_jax.data.hdus import check_ascii, filter_columns, set_table_hdu, sign_and_write, table_hdu
-from walop_jax.data.records import CalibrationSet, Compression, InputFile
+from walop_jax.data.records import ERROR_WORDS, CalibrationSet, Compression, InputFile
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
@@ -164,4 +164,7 @@ def _primary(calset: CalibrationSet, path: object) -> fits.PrimaryHDU:
         elif not np.isfinite(value):
             continue  # FITS headers know no NaN; a missing card is read as one
         primary.header[name] = (value, comment)
+    for name, value in calset.stated_errors.stated.items():
+        word, unit, *_ = ERROR_WORDS[name]
+        primary.header[word] = (value, f"{f'[{unit}] ' if unit else ''}standard error")
     return primary

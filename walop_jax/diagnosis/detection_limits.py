@@ -96,7 +96,7 @@ class ConditionLimit(NamedTuple):
     """Detection limit for the error of a number that a set states.
 
     `detected` in `unit`, infinite where no residual shows it; `error_of_qu` as that of `DetectionLimit`, at `size`:
-    the detection limit, or the largest plausible size where it is not detectable.
+    the detection limit, or the standard error of the number (`records.StatedErrors`) where that is smaller.
     """
 
     what: str
@@ -259,14 +259,16 @@ def _row(
         named = two_digits(limit.named) if np.isfinite(limit.named) else "never"
         detected = two_digits_range(*limit.detected)
         return name, detected, named, limit.unit, error, ", ".join(limit.taken_for)
-    size, unit = (np.nan, "") if hidden is None else (hidden.size, hidden.unit)
-    remark = "" if hidden is None or hidden.measured else f"error at {two_digits(size)}, the usual size"
     if limit is not None:
-        unit = limit.unit
-        if not np.isfinite(limit.detected):
-            remark = f"error at {two_digits(limit.size)} {unit}".rstrip()
-    detected = "never" if remark or not np.isfinite(size) else two_digits(size)
-    return name, detected, "", unit, error, remark
+        detected = two_digits(limit.detected) if np.isfinite(limit.detected) else "never"
+        smaller = limit.size < limit.detected
+        remark = f"error at {two_digits(limit.size)} {limit.unit}".rstrip() if smaller else ""
+        return name, detected, "", limit.unit, error, remark
+    if hidden is None:
+        return name, "never", "", "", error, ""
+    if not hidden.measured:
+        return name, "never", "", hidden.unit, error, f"error at {two_digits(hidden.size)}, the usual size"
+    return name, two_digits(hidden.size), "", hidden.unit, error, ""
 
 
 def _records(kind: Any, entries: Iterable[Mapping[str, Any]], endless: str) -> tuple[Any, ...]:
@@ -505,7 +507,7 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
             slope = slope - (above - below) / (2.0 * step)
         # Of errors as stated, not of the residuals: a plan has none.
         detected = float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
-        size = min(detected, stated.width)
+        size = min(detected, stated.error)
         error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
         limits.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
     return tuple(limits)

@@ -1,12 +1,18 @@
 """Errors undetectable in the data behind a fit: of the set, of the cameras, and effects missing from the model.
 
-A number that is wrong by h moves the parameters by δθ = R⁻¹QᵀC h (J = QR), and is found where h² |PC|² reaches the
-noncentrality of its test (`stated_conditions`), with a probability of 99 %. It hides at that size, or at the largest
-plausible one, for an effect the width of its prior. So does a number without any information in the data:
-P C = 0, or no sensitive exposure. The error of stars is the effect on their own light less the compensation by δθ
-(`calibration.could_hide`); without either of these a mistake has no consequence and is left out.
+A number that is wrong by h moves the parameters by δθ = R⁻¹QᵀC h (J = QR), and is found with a probability of 99 %
+where h² |PC|² reaches the noncentrality λ of its test (`stated_conditions`). What hides is what the data would not show
+and what is plausible as well:
 
-Symbols     C derivative of the residuals; P projection off the free parameters, Q, R of their Jacobian J
+    h = min(w, √λ s),   s = 1/|PC|
+
+with w the standard error of a number of the set (`records.StatedErrors`), for an effect the width of its prior. A
+number without any information in the data, P C = 0 or no sensitive exposure, hides at w. The error of stars is the
+effect on their own light less the compensation by δθ (`calibration.could_hide`); without either of these a mistake has
+no consequence and is left out.
+
+Symbols     C derivative of the residuals; P projection off the free parameters, Q, R of their Jacobian J; s standard
+            error with which the data measure a number
 Limits      One mistake at a time, one amplitude of an effect at a time, to first order. Effects of many places or
             thicknesses (blemish, fringes) are judged by patterns, and are not here.
 """

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.data.records import CalibrationSet
+from walop_jax.data.records import ERROR_WORDS, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
@@ -40,6 +40,7 @@ from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import with_error
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.laws import YEAR
 from walop_jax.model.specification import effect_context
 
 ALIKE = 25.0  # in χ², within which conditions are reported together
@@ -50,13 +51,16 @@ _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
 _PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capitaine et al. 2003, A&A 412, 567
+_J2000 = 51544.5  # MJD
 STEP = 1e-4  # of the width: the error of the derivative is its square
 
 
 class Stated(NamedTuple):
     """A number that a set states: what it is, its unit, what to check, what would measure it, the set with it changed.
 
-    `width` is by how much it may be wrong at most; `value` is None where only a change of it has a meaning.
+    `width` is by how much it may be wrong at most, and is searched; `error` is its standard error
+    (`records.StatedErrors`), of which a mistake is reckoned with where the data would not show it. `value` is None
+    where only a change of it has a meaning.
     `seen_by_stars`: whether stars are observed under the same condition. `along` is how the places of the field points
     (x, y) change with a number that is about them.
     """
@@ -66,6 +70,7 @@ class Stated(NamedTuple):
     remedy: str
     shown_by: str
     width: float
+    error: float
     changed: Callable[[float], CalibrationSet]
     value: float | None = None
     seen_by_stars: bool = False
@@ -75,9 +80,9 @@ class Stated(NamedTuple):
 class Single(NamedTuple):
     """One number, or a few of one thing, that may be otherwise: its columns, and its size in words.
 
-    `plausible` is the largest mistake to reckon with where the data would not show it, of each number; 0 where errors
-    hold it already. `stated` is the number of the set that it is, `probe` the effect, if it is one; `shown_by` the
-    measurement that would show it.
+    `plausible` is the mistake of each number to reckon with where the data would not show it: its standard error, or
+    the width of its prior; 0 where the errors of the fit hold it already. `stated` is the number of the set that it is,
+    `probe` the effect, if it is one; `shown_by` the measurement that would show it.
     """
 
     candidate: Candidate
@@ -201,7 +206,7 @@ def _conditions(design: Design, what: str = "") -> Iterator[Single]:
             continue
         candidate = Candidate(item.what, column, np.array([item.width]))
         # What stars see as well is no mistake of the matrix alone.
-        plausible = 0.0 if item.seen_by_stars else item.width
+        plausible = 0.0 if item.seen_by_stars else item.error
         wording = functools.partial(_condition_in_words, item)
         yield Single(candidate, wording, plausible, item.unit, item.shown_by, item)
 
@@ -239,25 +244,31 @@ def _of_cameras(design: Design) -> Iterator[Single]:
     median[exposed] = np.nanmedian(np.where(measured.used[..., None], counts, np.nan)[:, exposed], axis=0)
     typical = float(np.median(counts[measured.used])) if measured.used.any() else 0.0
 
-    def single(k: int, change: np.ndarray, width: float, words: str, unit: str, shown_by: str) -> Single:
+    errors = design.fit.calset.stated_errors
+
+    def single(
+        k: int, change: np.ndarray, error: tuple[str, float], words: str, unit: str, by: str
+    ) -> Single:
         cube = np.zeros_like(counts)
         cube[..., k] = change
         rows = design.stacked([measured.derivative(cube)[:, None]])
-        name = words.format(names[k])
+        name, (of, units) = words.format(names[k]), error
         wording = functools.partial(_worded, f"{name} of", unit=unit)
-        return Single(Candidate(name, rows, np.array([width])), wording, width, unit, shown_by)
+        candidate = Candidate(name, rows, np.array([units * ERROR_WORDS[of].usual]))
+        return Single(candidate, wording, units * getattr(errors, of), unit, by)
 
     if not measured.used.any():
         return
     for k in range(measured.cameras):
-        yield single(k, counts[..., k] ** 2 / 1e6, 0.02, "a non-linearity of {}", "at 10⁶ electrons", _LEVELS)
-        level = np.broadcast_to(median[:, k], counts.shape[:2])
-        yield single(k, level, 0.003, "scattered light in {}", "of the median counts", _LEVELS)
-        yield single(k, np.ones_like(counts[..., k]), 0.003 * typical, "a pedestal in {}", "electrons", _DARK)
+        square, level = counts[..., k] ** 2 / 1e6, np.broadcast_to(median[:, k], counts.shape[:2])
+        yield single(k, square, ("linearity", 1.0), "a non-linearity of {}", "at 10⁶ electrons", _LEVELS)
+        yield single(k, level, ("scattered", 1.0), "scattered light in {}", "of the median counts", _LEVELS)
+        pedestal = "pedestal", typical
+        yield single(k, np.ones_like(counts[..., k]), pedestal, "a pedestal in {}", "electrons", _DARK)
         for source in range(measured.cameras):
             if source != k:
                 words = f"light of {names[source]} in {{}}"
-                yield single(k, counts[..., source], 0.02, words, "of its counts", _ONE_STAR)
+                yield single(k, counts[..., source], ("leakage", 1.0), words, "of its counts", _ONE_STAR)
 
 
 def _asked_effects(design: Design) -> tuple[Probe, ...]:
@@ -336,13 +347,14 @@ def _column(design: Design, statement: Stated) -> np.ndarray:
 
 
 def _stated(calset: CalibrationSet) -> Iterator[Stated]:
+    errors = calset.stated_errors
     if len(calset.points) > 1:
         yield from _of_field(calset)
     for name in calset.filters:
         remedy = "check its curve, and what the polariser exposures were taken through"
         moved = functools.partial(_with_wavelength, calset, name)
         what, shown_by = f"the wavelengths of filter {name}", "a measured curve of the filter"
-        yield Stated(what, "um", remedy, shown_by, 0.05, moved, seen_by_stars=True)
+        yield Stated(what, "um", remedy, shown_by, 0.05, errors.wavelength, moved, seen_by_stars=True)
     e = calset.exposures
     for kind in np.unique(e.kind):
         chosen = (e.kind == kind) & np.isfinite(e.teff)
@@ -351,7 +363,8 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
             warmer = functools.partial(_moved, calset, chosen, "teff", e.teff / typical)
             stated = typical if np.ptp(e.teff[chosen]) == 0.0 else None
             what = f"TEFF of exposures of kind {kind}"
-            yield Stated(what, "K", remedy, "a measured spectrum of their light", typical, warmer, stated)
+            shown_by, error = "a measured spectrum of their light", errors.teff * typical
+            yield Stated(what, "K", remedy, shown_by, typical, error, warmer, stated)
     yield from _of_sky(calset)
     table = calset.intensities
     if isinstance(table, TableIntensities) and (sky := table.sky) is not None and sky.any():
@@ -361,7 +374,7 @@ def _stated(calset: CalibrationSet) -> Iterator[Stated]:
             return dataclasses.replace(calset, intensities=dataclasses.replace(table, counts=counts))
 
         what, remedy = "the light of the sky that is left, in units of SKY,", "subtract the sky anew"
-        yield Stated(what, "", remedy, "the same stars under another sky", 0.1, less, 0.0)
+        yield Stated(what, "", remedy, "the same stars under another sky", 0.1, errors.sky, less, 0.0)
 
 
 def _moved(
@@ -373,7 +386,7 @@ def _moved(
 
 def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
     """Mistakes in the place and the time of the sky, as the exposures and the site state them."""
-    e, site = calset.exposures, calset.site
+    e, site, errors = calset.exposures, calset.site, calset.stated_errors
     moon = (e.kind == "moon") & np.isfinite(e.ra) & np.isfinite(e.dec)
     if moon.any():
         by_year, across = _PRECESSION
@@ -386,26 +399,32 @@ def _of_sky(calset: CalibrationSet) -> Iterator[Stated]:
 
         remedy = "they are to be ICRS, not coordinates of date"
         solved = "an astrometric solution of frames of the same fields"
-        yield Stated("the equinox of RA and DEC", "", remedy, solved, 100.0, of_date, 2000.0)
+        # Who takes coordinates of date for ICRS is wrong by the years since 2000.
+        years = float(np.abs(np.median(e.mjd[moon]) - _J2000) / YEAR)
+        yield Stated("the equinox of RA and DEC", "", remedy, solved, 100.0, years, of_date, 2000.0)
         at = "check RA and DEC: ICRS, of the centre of the field (docs: conventions)"
         when = "check the clock and the time zone: UTC at mid-exposure"
-        for name, unit, width, remedy, shown_by in (
-            ("RA", "deg", 5.0, at, solved),
-            ("DEC", "deg", 5.0, at, solved),
-            ("MJD", "d", 1.0, when, "a clock that is compared with UTC"),
+        pointing, clock = errors.pointing / 3600.0, errors.time / 86400.0
+        in_ra = pointing / max(float(np.cos(np.deg2rad(np.median(e.dec[moon])))), 0.1)
+        for name, unit, width, error, remedy, shown_by in (
+            ("RA", "deg", 5.0, in_ra, at, solved),
+            ("DEC", "deg", 5.0, pointing, at, solved),
+            ("MJD", "d", 1.0, clock, when, "a clock that is compared with UTC"),
         ):
             moved = functools.partial(_moved, calset, moon, name.lower(), 1.0)
-            yield Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, moved)
+            yield Stated(f"{name} of sky exposures", unit, remedy, shown_by, width, error, moved)
         for name, width in (("longitude", 180.0), ("latitude", 90.0)):
             elsewhere = functools.partial(_at_site, calset, name)
             remedy, shown_by = "check the site in the header", "the position of the telescope on a map"
             value = float(getattr(site, name))
-            yield Stated(f"the {name} of the site", "deg", remedy, shown_by, width, elsewhere, value)
+            what = f"the {name} of the site"
+            yield Stated(what, "deg", remedy, shown_by, width, errors.site, elsewhere, value)
     for kind in np.unique(e.kind[np.isfinite(e.rotator)]):
         remedy = "check its zero and its sense (docs: conventions)"
         moved = functools.partial(_moved, calset, e.kind == kind, "rotator", 1.0)
         shown_by = "polarised standards at several ROTATOR angles"
-        yield Stated(f"ROTATOR of exposures of kind {kind}", "deg", remedy, shown_by, 45.0, moved)
+        what = f"ROTATOR of exposures of kind {kind}"
+        yield Stated(what, "deg", remedy, shown_by, 45.0, errors.rotator, moved)
 
 
 def _at_site(calset: CalibrationSet, name: str, step: float) -> CalibrationSet:
@@ -419,14 +438,16 @@ def _of_field(calset: CalibrationSet) -> Iterator[Stated]:
     solved = "an independent check of the field positions"
     x, y = calset.points.x, calset.points.y
     radius, ones = float(np.hypot(x, y).max()), np.ones(len(x))
-    for what, unit, width, along in (
-        ("X of all field points", "deg", radius, (ones, 0.0 * ones)),
-        ("Y of all field points", "deg", radius, (0.0 * ones, ones)),
-        ("the scale of X and Y", "", 1.0, (x, y)),
-        ("the angle of the field", "rad", 1.0, (-y, x)),
+    errors = calset.stated_errors
+    offset = errors.position / 3600.0
+    for what, unit, width, error, along in (
+        ("X of all field points", "deg", radius, offset, (ones, 0.0 * ones)),
+        ("Y of all field points", "deg", radius, offset, (0.0 * ones, ones)),
+        ("the scale of X and Y", "", 1.0, errors.scale, (x, y)),
+        ("the angle of the field", "rad", 1.0, errors.turn, (-y, x)),
     ):
         moved = functools.partial(_displaced, calset, along)
-        yield Stated(what, unit, check, solved, width, moved, along=along)
+        yield Stated(what, unit, check, solved, width, error, moved, along=along)
 
 
 def _displaced(calset: CalibrationSet, along: tuple[np.ndarray, np.ndarray], step: float) -> CalibrationSet:

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.checks import checked_curve
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
-from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site
+from walop_jax.data.records import Exposures, FilterCurve, Points, Position, Site, StatedErrors
 from walop_jax.data.settings import BUILTIN_FILTERS, DEFAULT_FILTER, builtin_filter, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import default_name, described, shipped
@@ -161,6 +161,8 @@ class ObservingPlan:
 
     A plan may also say each exposure: `stops` in place of all combinations, in order; `patches` and `stars` are the
     numbers, from 0, of the Moon patches and standards that are taken after them (None: each once, unless stops say).
+    `stated_errors` are those of positions, times and all other numbers of the set that are not the usual ones
+    (`records.StatedErrors`).
 
     >>> walop.ObservingPlan(grid=4)
     ObservingPlan('WALOP-SOUTH', grid=4, field=0.29, moving={})
@@ -196,12 +198,14 @@ class ObservingPlan:
     patches: tuple[int, ...] | None = None
     stars: tuple[int, ...] | None = None
     full_turn: dataclasses.InitVar[bool | None] = None
+    stated_errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         text = (
             f"{field.name}={getattr(self, field.name)!r}"
             for field in dataclasses.fields(self)
             if field.name != "instrument" and getattr(self, field.name) != field.default
+            if field.name != "stated_errors" or self.stated_errors
         )
         return f"ObservingPlan({', '.join([repr(self.name), *text])})"
 
@@ -241,6 +245,7 @@ class ObservingPlan:
             raise ValueError(f"polariser_angles: {self.name} has no polariser")
         elif not (self.lamps or self.stops or self.moon_patches or self.standards):
             raise ValueError("no exposures: give lamps, Moon patches or standards")
+        StatedErrors.of(self.stated_errors)  # a name or a number that is none is an error here
         if isinstance(self.filters, Mapping):
             object.__setattr__(self, "filters", tuple(_own_filter(*item) for item in self.filters.items()))
         if len(self.curves()) < len(self.filters):
@@ -302,11 +307,13 @@ class ObservingPlan:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
+        fields["stated_errors"] = dict(self.stated_errors)
         if any(isinstance(entry, FilterCurve) for entry in self.filters):
             fields["filters"] = {_name_of(entry): _curve_document(entry) for entry in self.filters}
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
+        later |= {"stated_errors": {}}
         later |= {"spacing": type(self).spacing}
         later |= {name: getattr(type(self), name) for name in fields if name.startswith("zero_")}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.records import Block, CalibrationSet, Sources
+from walop_jax.data.records import Block, CalibrationSet, Sources, StatedErrors
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.text import rounded
 from walop_jax.likelihood import engine
@@ -304,6 +304,7 @@ def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: in
         sources=sources,
         filters=plan.curves(),
         intensities=TableIntensities.dense(points, block),
+        stated_errors=StatedErrors.of(plan.stated_errors),
     )
 
 
