@@ -317,7 +317,8 @@ def slopes_over_field(
     """`matrix_slopes` at many positions, interpolated where the optics are smooth.
 
     `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
-    that is checked (`field_table.held_out`).
+    that is checked (`field_table.held_out`). No table is tried that has more nodes than half of the positions, nor
+    beside local features, which none follows: it would cost more than the positions themselves.
     """
     exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
@@ -327,10 +328,9 @@ def slopes_over_field(
         return float(np.max(np.abs(errors - true_errors) / np.where(true_errors > 0, true_errors, 1.0)))
 
     corners = Rectangle(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
-    table = None
-    if len(x) > counts[0] ** 2 and np.all(corners.high > corners.low):
-        details = details_of(instrument)
-        table, off = accurate_table(exact, corners, counts, tolerance, error, details=details)
+    table, worth = None, [count for count in counts if 2 * count**2 <= len(x)]
+    if worth and np.all(corners.high > corners.low) and not details_of(instrument):
+        table, off = accurate_table(exact, corners, worth, tolerance, error)
         table = table if off <= tolerance else None
     return exact(x, y) if table is None else table(x, y)
 

@@ -56,7 +56,15 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, Vector, gram
+from walop_jax.diagnosis.score import (
+    Candidate,
+    Projector,
+    ScoreSpace,
+    ScoreTable,
+    Vector,
+    gram,
+    joined_in_batches,
+)
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
 from walop_jax.likelihood.columns import Columns
@@ -400,7 +408,8 @@ class Design:
         self, columns: Sequence[Float[np.ndarray, "_ _"]], rows: Float[np.ndarray, "_ ..."]
     ) -> Float[np.ndarray, "_ ..."]:
         """Cᵀ times rows, of the columns C that `stacked` puts side by side."""
-        return np.concatenate([block.T @ rows[: self.rows] for block in columns]) / self.fit.noise_scale
+        products = [joined.T @ rows[: self.rows] for _, joined in joined_in_batches(columns)]
+        return np.concatenate(products) / self.fit.noise_scale
 
     def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""

@@ -56,7 +56,6 @@ from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.light import mean_wavelengths
 
 EXPECTED = 1.0  # number of undetected changes beforehand
 LEFT_OUT = 1e-3  # share of the undetected variance of the matrix that a product may lack
@@ -191,8 +190,7 @@ class _AtData(InExposures):
     def of(cls, columns: Columns) -> Self:
         """Those of a likelihood."""
         points, plan = columns.likelihood.calset.points, columns.plan
-        of_bands = np.asarray(mean_wavelengths(columns.patched, plan))
-        wavelength = of_bands[np.asarray(plan.band_of)[:, 0]]
+        wavelength = columns.wavelength[np.asarray(plan.band_of)[:, 0]]
         return cls(
             columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
         )

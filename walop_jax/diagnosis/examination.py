@@ -355,7 +355,7 @@ class Examination(Evidence):
     def space_beside(self, basis: Matrix) -> tuple[Matrix, ScoreSpace]:
         """Products of all columns with a basis of parameters that are taken out (`Design.without`); the space then."""
         along = self.design.products(self.columns, basis)
-        return along, dataclasses.replace(self.bare, gram=self.bare.gram + along @ along.T)
+        return along, self.bare.with_known(along)
 
     def separation(self, name: str, change: Vector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""

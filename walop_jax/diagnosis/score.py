@@ -26,7 +26,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -174,7 +174,7 @@ class ScoreSpace:
     sizes: tuple[int, ...]
     widths: Vector
     before: Vector
-    gram: Matrix
+    gram: Matrix | Less
     free: int
 
     @classmethod
@@ -199,9 +199,9 @@ class ScoreSpace:
         places = [slice(first, last) for first, last in itertools.pairwise(stop.tolist())]
         basis, count = projector.basis, int(stop[-1])
         before, along = np.empty(count), np.empty((basis.shape[1], count))
-        for at, block in zip(places, columns, strict=True):
-            before[at] = np.einsum("dk,dk->k", block, block, dtype=float) / scale**2
-            along[:, at] = basis[: len(block)].T @ block / scale
+        for at, joined in joined_in_batches(columns):
+            before[at] = np.einsum("dk,dk->k", joined, joined) / scale**2
+            along[:, at] = basis[: len(joined)].T @ joined / scale
         products, alone = np.zeros((count, count)), [np.zeros((size, size)) for size in sizes]
         for first in range(0, len(basis), limits.PRODUCT_ROWS):
             rows = slice(first, first + limits.PRODUCT_ROWS)
@@ -210,7 +210,7 @@ class ScoreSpace:
                 rows_of_block = block[rows].T
                 remainder[at, : rows_of_block.shape[1]] += rows_of_block / scale
                 square += remainder[at] @ remainder[at].T
-            products += gram(remainder.T, exact)
+            add_gram(products, remainder.T, exact)
         for at, square in zip(places, alone, strict=True):
             products[at, at] = square
         return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, products, projector.free)
@@ -234,7 +234,7 @@ class ScoreSpace:
     @functools.cached_property
     def alive(self) -> Bool[np.ndarray, " _"]:
         """Amplitudes of which the base leaves something and that would stand out at a plausible size."""
-        after = np.clip(np.diag(self.gram), 0.0, None)
+        after = np.clip(self.gram.diagonal(), 0.0, None)
         share = np.where(self.before > 0, after / np.where(self.before > 0, self.before, 1.0), 0.0)
         return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)
 
@@ -243,7 +243,7 @@ class ScoreSpace:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
         return {name: whitening(self._of_alive(at)) for name, at in self.places().items()}
 
-    def _of_alive(self, at: slice = slice(None)) -> Matrix:
+    def _of_alive(self, at: slice) -> Matrix:
         """A block of the Gram matrix, 0 for amplitudes that are not alive."""
         alive = self.alive[at]
         return np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
@@ -264,13 +264,17 @@ class ScoreSpace:
             return scores - along @ explained, square - float(explained @ explained)
 
         free = self.free - (w.shape[1] if widths is None else 0)
-        return dataclasses.replace(self, gram=self.gram - along @ along.T, free=free), reduce
+        return dataclasses.replace(self, gram=Less.of(self.gram, along, along), free=free), reduce
+
+    def with_known(self, along: Matrix) -> ScoreSpace:
+        """The space when directions that were taken out of the columns are in them again; `along` are their parts."""
+        return dataclasses.replace(self, gram=Less.of(self.gram, -along, along))
 
     # ------------------------------------------------------------------------------------------ scores
 
     @functools.cached_property
     def _root(self) -> _Root:
-        return _Root(self._of_alive())
+        return _Root(self.gram, self.alive)
 
     def table_after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
@@ -314,7 +318,7 @@ class ScoreSpace:
         if not self._root.rank:
             return np.zeros(0)
         # Scores s = L n have covariance G for unit normals n. Seven digits are plenty for a count.
-        root = self._root.whole.astype(np.float32)
+        root = self._root.whole
         return self.smallest_of(root @ rng.standard_normal((draws, root.shape[1]), dtype=np.float32).T)
 
     def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> Vector:
@@ -330,34 +334,67 @@ class ScoreSpace:
         return smallest
 
 
+class Less:
+    """A symmetric matrix P − L Rᵀ of which only the entries that are asked for are made: P is large, L, R are narrow.
+
+    Indices are those of an array of numpy with two axes.
+    """
+
+    def __init__(self, whole: Matrix, left: Matrix, right: Matrix) -> None:
+        self.whole, self.left, self.right = whole, left, right
+
+    @classmethod
+    def of(cls, matrix: Matrix | Less, left: Matrix, right: Matrix) -> Less:
+        """A matrix less another product L Rᵀ."""
+        if not isinstance(matrix, Less):
+            return cls(matrix, left, right)
+        return cls(matrix.whole, np.hstack([matrix.left, left]), np.hstack([matrix.right, right]))
+
+    def __getitem__(self, index: tuple[Any, Any]) -> Any:
+        rows, columns = (np.ravel(at) if isinstance(at, np.ndarray) else at for at in index)
+        return self.whole[index] - self.left[rows] @ self.right[columns].T
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:, :], dtype)
+
+    def diagonal(self) -> Vector:
+        """Entries of the diagonal."""
+        return self.whole.diagonal() - np.sum(self.left * self.right, axis=1)
+
+
 class _Root:
     """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.
 
-    Columns of which less than `ROOT_TOLERANCE` of their square is left behind those before them add nothing.
+    Rows and columns that are not `alive` are 0. Columns of which less than `ROOT_TOLERANCE` of their square is left
+    behind those before them add nothing. Seven digits of L are plenty for draws.
     Source: Higham 1990, in Reliable Numerical Computation (Oxford), 161; LAPACK dpstrf.
     """
 
-    def __init__(self, gram: Matrix) -> None:
-        norm = np.sqrt(np.clip(np.diag(gram), 0.0, None))
+    def __init__(self, gram: Matrix | Less, alive: Bool[np.ndarray, " _"]) -> None:
+        norm = np.sqrt(np.where(alive, np.clip(gram.diagonal(), 0.0, None), 0.0))
         nonzero = np.flatnonzero(norm)
-        self.whole, self.rank = np.zeros((len(norm), 0)), 0
+        self.whole, self.rank = np.zeros((len(norm), 0), np.float32), 0
         if not len(nonzero):
             return
-        scaled = gram[np.ix_(nonzero, nonzero)] / np.outer(norm[nonzero], norm[nonzero])
+        scaled = np.empty((len(nonzero), len(nonzero)), order="F")  # as LAPACK has it: no copy is made
+        for first in range(0, len(nonzero), limits.COLUMNS_TOGETHER):
+            at = slice(first, first + limits.COLUMNS_TOGETHER)
+            scaled[:, at] = gram[np.ix_(nonzero, nonzero[at])] / np.outer(norm[nonzero], norm[nonzero[at]])
         factor, pivots, self.rank, _ = linalg.lapack.dpstrf(  # pyright: ignore[reportAttributeAccessIssue]
             scaled, tol=ROOT_TOLERANCE, overwrite_a=True
         )
         order = nonzero[pivots - 1]
-        upper = np.triu(factor)[: self.rank]
-        self.whole = np.zeros((len(norm), self.rank))
-        self.whole[order] = upper.T * norm[order, None]
         self._chosen = order[: self.rank]
+        self._first = np.triu(factor[: self.rank, : self.rank]).T * norm[self._chosen, None]
+        self.whole = np.zeros((len(norm), self.rank), np.float32)
+        self.whole[self._chosen] = self._first
+        self.whole[order[self.rank :]] = factor[: self.rank, self.rank :].T * norm[order[self.rank :], None]
 
     def explained(self, scores: Vector) -> float:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""
         if not self.rank:
             return 0.0
-        solution = linalg.solve_triangular(self.whole[self._chosen], scores[self._chosen], lower=True)
+        solution = linalg.solve_triangular(self._first, scores[self._chosen], lower=True)
         return float(solution @ solution)
 
 
@@ -407,20 +444,37 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 # ------------------------------------------------------------------------------------------- products of large matrices
 
 
-def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[np.ndarray, "n n"]:
-    """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
+def joined_in_batches(columns: Sequence[Matrix]) -> Iterator[tuple[slice, Matrix]]:
+    """The columns of all blocks side by side in float64, some `limits.COLUMNS_TOGETHER` at a time, and their places."""
+    stop = np.cumsum([0, *(block.shape[1] for block in columns)])
+    group_of = stop[:-1] // limits.COLUMNS_TOGETHER
+    for _, group in itertools.groupby(range(len(columns)), lambda number: group_of[number]):
+        numbers = list(group)
+        joined = np.concatenate([columns[number].T for number in numbers], dtype=float).T
+        yield slice(int(stop[numbers[0]]), int(stop[numbers[-1] + 1])), joined
+
+
+def gram(columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
+    """CᵀC."""
+    products = np.zeros((columns.shape[1], columns.shape[1]))
+    add_gram(products, columns)
+    return products
+
+
+def add_gram(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int | None = None) -> None:
+    """Add CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
     count = columns.shape[1]
     single = columns if exact is None or exact >= count else columns.astype(np.float32)
-    products = np.empty((count, count))
     starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
     pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
 
     def product(pair: tuple[slice, slice]) -> None:
         first, second = pair
         source = columns if exact is None or second.stop <= exact else single
-        products[first, second] = source[:, first].T @ source[:, second]
-        products[second, first] = products[first, second].T
+        added = source[:, first].T @ source[:, second]
+        products[first, second] += added
+        if first != second:
+            products[second, first] += added.T
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(product, itertools.combinations_with_replacement(pieces, 2)))
-    return products

@@ -156,7 +156,7 @@ def scored(design: Design, rivals: Sequence[Single]) -> Singles:
     space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
     table = space.table(columns.T @ residual, float(residual @ residual))
-    rest, places = np.diag(space.gram), space.places().values()
+    rest, places = space.gram.diagonal(), space.places().values()
     items = (
         Scored(rival, score, along[:, at], rest[at], space.alive[at])
         for rival, score, at in zip(rivals, table.scores, places, strict=True)

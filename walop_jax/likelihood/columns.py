@@ -193,6 +193,9 @@ _fringes_at = compiled(
     optimised_above=limits.SELDOM_OPTIMISED_ABOVE,
     kept_as="fringes",
 )
+_mean_wavelengths = compiled(
+    light.mean_wavelengths, optimised_above=limits.OPTIMISED_ABOVE, kept_as="wavelengths"
+)
 _visible = compiled(_visibilities, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, kept_as="visibilities")
 _detectors = compiled(_pushed, kept_as="detector_slopes")
 
@@ -270,6 +273,11 @@ class Columns:
         for place in patched.places(WavePlate):
             patched = patched.changed(place, air_gaps=lambda gaps: (*gaps, gap))
         return plan_for(patched, calset.exposures, calset.filters, calset.sources)
+
+    @functools.cached_property
+    def wavelength(self) -> Float[np.ndarray, " b"]:
+        """Mean wavelengths (µm) of the bands."""
+        return np.asarray(_mean_wavelengths(self.patched, self.plan))
 
     @functools.cached_property
     def median(self) -> Float[np.ndarray, "e k"]:

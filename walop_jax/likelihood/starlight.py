@@ -9,7 +9,7 @@ Limits      First order. Changes of sources, of the polariser, of detectors and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.columns import Change, Columns, ResponseBlock
 from walop_jax.model.effects.change import InExposures, SlotTerm
 from walop_jax.model.effects.factors import FIELD, Units, factor
-from walop_jax.model.slots import Slot, generators_ahead
+from walop_jax.model.effects.optics import generator
 
 
 def added_to_starlight(
@@ -27,12 +27,9 @@ def added_to_starlight(
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     """Analysis vectors at the field points in the setting of an exposure, and the part added by each change."""
     changed_terms = [columns.terms_of(change) for change in changes]
-    slots = {term.slot for terms in changed_terms for term in terms}
-    light = sorted(slot for slot in slots if slot[0] == "light" and slot[2] == "ahead of")
-    ahead = generators_ahead(columns.patched, light)
     points, size, batches = len(columns.likelihood.used), limits.RESPONSES_TOGETHER, []
     for start in range(0, points, size):
-        terms = _at_points(ResponseBlock(columns, start, ()), changed_terms, exposure, ahead)
+        terms = _at_points(ResponseBlock(columns, start, ()), changed_terms, exposure)
         batches.append(tuple(term[: points - start] for term in terms))
     vectors, added = (np.concatenate(terms) for terms in zip(*batches, strict=True))
     return vectors, added
@@ -42,7 +39,6 @@ def _at_points(
     block: ResponseBlock,
     changes: Sequence[Sequence[SlotTerm]],
     exposure: int,
-    ahead: Mapping[Slot, np.ndarray],
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     points, band = np.arange(len(block.x)), block.band[:, exposure]
     vectors = np.asarray(block.found.vectors.vectors)[points, 0, band]  # p k 4
@@ -52,8 +48,8 @@ def _at_points(
         for slot, coefficient, factors in terms:
             if slot in block.of.of_vectors:
                 change = block.change(slot)[points, 0, band]
-            elif slot in ahead:
-                change = vectors @ ahead[slot]
+            elif slot[0] == "light" and slot[2] == "ahead of":
+                change = vectors @ generator(slot[1])
             elif slot[0] == "counts":
                 change = vectors * np.asarray(slot[1])[:, None]
             else:

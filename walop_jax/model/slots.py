@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -30,11 +30,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
-from walop_jax.model.compiled import array, compiled
 from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
-from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, matrix_of, with_air_gap
+from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, generator, with_air_gap
 from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.geometry import PupilMapping
 from walop_jax.model.elements.wave_plate import WavePlate, fringe
@@ -298,12 +297,7 @@ def _inserted(
     behind, ahead = (jnp.stack([sides[place][side] for place in sorted(sides)]) for side in (0, 1))
     pairs = jnp.einsum("hcnri,hcnjk->hijcnrk", behind, ahead)
     products = jnp.stack([light.integrated(plan, weights, pairs) for weights in moments])
-    changes, zero = [Change(kind, "of", "") for kind in GENERATORS], jnp.zeros(())
-
-    def matrix(sizes: Float[Array, " g"]) -> Float[Array, "4 4"]:
-        return matrix_of(list(zip(changes, sizes, strict=True)), zero, zero)
-
-    generators = jax.jacfwd(matrix)(jnp.zeros(len(changes)))
+    generators = jnp.asarray(np.stack([generator(kind) for kind in GENERATORS], axis=-1))
     return jnp.einsum("ijg,mhijbrk->mghbrk", generators, products)
 
 
@@ -376,14 +370,3 @@ def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instr
         q, u = sources[Standards.name]
         instrument = instrument.changed(Standards.name, q=lambda old: old + q, u=lambda old: old + u)
     return instrument
-
-
-def generators_ahead(instrument: Instrument, slots: Sequence[Slot]) -> dict[Slot, Float[np.ndarray, "4 4"]]:
-    """Slopes of Mueller matrices in slots of the light ahead of the polariser of an instrument (`patched`)."""
-    zero = array(0.0)
-
-    def matrices(size: Scalar) -> list[Any]:
-        instruments = [patched(instrument, [(Change(*slot[1:]), size)]) for slot in slots]
-        return [changed.telescope()[-1].mueller(Ray.entering(zero, zero)) for changed in instruments]
-
-    return dict(zip(slots, map(np.asarray, compiled(jax.jacfwd(matrices))(zero)), strict=True))

@@ -21,10 +21,12 @@ from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN, factor
-from walop_jax.model.effects.optics import matrix_of
+from walop_jax.model.effects.optics import ADDED, GENERATORS, generator, matrix_of
+from walop_jax.model.elements.simple import AddedPolarisation
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
 from walop_jax.model.planning import exposure_arrays
+from walop_jax.model.ray import Ray
 from walop_jax.model.sources import Sight
 
 
@@ -88,6 +90,22 @@ def test_depolarisation_of_a_stokes_parameter():
     along_q, along_u = both @ jnp.array([1.0, 1.0, 0.0, 0.0]), both @ jnp.array([1.0, 0.0, 1.0, 0.0])
     assert np.linalg.norm(along_q[1:]) == pytest.approx(1.0)  # turned to u before q is lost
     assert np.linalg.norm(along_u[1:]) == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("kind", GENERATORS)
+def test_generators_are_the_slopes_of_their_matrices(kind):
+    change = Change(kind, "of", "plate")
+    slope = jax.jacfwd(lambda size: matrix_of([(change, size)], 0.0, 0.0))(0.0)
+    np.testing.assert_allclose(generator(kind), slope, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ADDED)
+def test_generators_of_added_polarisation_are_the_slopes_of_its_matrix(kind):
+    def matrix(size):
+        added = AddedPolarisation(name="added", q=jnp.zeros(()), u=jnp.zeros(()))
+        return dataclasses.replace(added, **{kind[-1]: size}).mueller(Ray.on_trial(()))
+
+    np.testing.assert_allclose(generator(kind), jax.jacfwd(matrix)(jnp.zeros(())), atol=1e-15)
 
 
 @pytest.mark.parametrize(("change", "factor"), IN_VAIN)

@@ -106,6 +106,22 @@ def near_identity(sums: Mapping[str, Any]) -> Mueller:
     return matrix
 
 
+def generator(kind: str) -> Float[np.ndarray, "4 4"]:
+    """∂M/∂size at the identity of one of `GENERATORS` or `ADDED`, in closed form."""
+    what, _, axis = kind.rpartition(" ")
+    slope, along = np.zeros((4, 4)), 1 + "quv".index(axis)
+    if what == "diattenuation":
+        slope[0, along] = slope[along, 0] = 1.0
+    elif what == "retardance":  # the Stokes vector turned about the axis
+        first, second = 1 + along % 3, 1 + (along + 1) % 3
+        slope[first, second], slope[second, first] = 1.0, -1.0
+    elif what == "depolarisation":
+        slope[along, along] = -1.0
+    else:
+        slope[along, 0] = 1.0
+    return slope
+
+
 class Terms(Element):
     """Changes at one place of the train."""
 
