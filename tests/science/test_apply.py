@@ -21,8 +21,9 @@ from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.specification import effect_context, make_model, with_effects
-from walop_jax.science.apply import COOL, HOT, apply
+from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
+from walop_jax.science.colours import COOL, HOT
 from walop_jax.science.detectors import errors_of, linearised
 from walop_jax.simulation.simulate import simulate
 

@@ -52,8 +52,9 @@ from walop_jax.model.effects import effect_by_name  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
 from walop_jax.model.planning import plan_for_settings  # noqa: E402
 from walop_jax.model.specification import with_effects  # noqa: E402
-from walop_jax.science.apply import COOL, HOT, apply  # noqa: E402
+from walop_jax.science.apply import apply  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
+from walop_jax.science.colours import COOL, HOT  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
 STARS, ELECTRONS, COLOURS = 200, 4e6, 16

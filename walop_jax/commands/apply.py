@@ -58,6 +58,12 @@ def apply(
     2097152 no ROTATOR where others have one, 4194304 the counts of another row; bits of the calibration itself are
     added to all rows. Copies of a row are left out; columns that are not used are named.
 
+    The first line says whether the catalogue is to be trusted. Exit code 3 where it is not: the calibration is not
+    trusted, it is of another instrument, the stars together contradict it, or most stars are flagged. Where they
+    contradict it by more than an instrument changes, other readings of the catalogue are tried (orders of the cameras,
+    signs and turns of ROTATOR, a shifted pointing, mirrored fields, magnitudes, filters, gains), and the one that mends
+    it is said first.
+
     Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
 
     The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does, which has
@@ -66,8 +72,9 @@ def apply(
     With --each every CATALOGUE is reduced by itself into the folder OUT, in this process or by Dask (--workers,
     --scheduler): a table appears whole or not at all, and one that is there is not made again.
 
-    In Python: an astropy table; `catalogue` is a path, an astropy table, columns by name, or the paths of all cameras.
-    With `each` the paths of the tables; `scheduler` is an address or any `concurrent.futures.Executor`.
+    In Python: an astropy table, whose meta has TRUSTED and the first DOUBT; `catalogue` is a path, an astropy table,
+    columns by name, or the paths of all cameras. With `each` the paths of the tables; `scheduler` is an address or any
+    `concurrent.futures.Executor`.
 
     >>> star = {"X": [0.1], "Y": [0.0], "N": [[51e4, 49e4, 50e4, 48e4]], "N_ERR": [[714.0, 700.0, 707.0, 693.0]]}
     >>> walop.apply(result, star)["P", "P_ERR", "EVPA"]  # doctest: +SKIP
@@ -79,6 +86,7 @@ def apply(
     from walop_jax.posterior.draws import with_moments
     from walop_jax.science import stokes_columns as added
     from walop_jax.science.apply import apply as apply_to_rows
+    from walop_jax.science.catalogue_verdict import verdict_on
     from walop_jax.science.common_table import in_common_form
     from walop_jax.science.overlaps import overlap
     from walop_jax.science.polarisation import ESTIMATORS
@@ -113,20 +121,27 @@ def apply(
         seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
     columns = added.stokes_columns(stars, rows.star, debias)
-    warnings = [*gathering_remarks, *added.sentences(rows, stars, held.design.cameras.names)]
-    warnings += [] if seen_twice is None else seen_twice.warnings()
+    verdict = verdict_on(used, rows, stars, seen_twice)
+    warnings = [
+        *verdict.reservations,
+        *gathering_remarks,
+        *added.sentences(rows, stars, held.design.cameras.names),
+    ]
     on_the_sky = sum(map(math.isfinite, rows.rotator)) / max(len(rows.rotator), 1)
     outcome = table_outcome(
         job,
         held,
         table,
         columns,
-        added.header(held.content_hash(), debias, on_the_sky, stars.check),
+        added.header(held.content_hash(), debias, on_the_sky, stars.check, verdict),
         output,
         counted=added.counted_flags(rows, used.model.template),
         warnings=warnings,
         remade=in_common_form if common else None,
         extra={
+            "trusted": verdict.trusted,
+            "doubts": list(verdict.doubts),
+            "reservations": list(verdict.reservations),
             "stars": len(stars.qu),
             "seconds": job.seconds,
             "estimator": debias,
@@ -137,11 +152,21 @@ def apply(
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
     size = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
-    text = f"{output}: {size}{added.errors_in_words(columns)}{zones}"
+    where = "Catalogue" if output is None else output
+    text = f"{where}: {verdict.words}\n{size}{added.errors_in_words(columns)}{zones}"
     step = (
         shlex.join(("topcat", str(output))) if common else typed("watch", calibration, output, "-o", "WATCH")
     )
-    return dataclasses.replace(outcome, text=text, next=(step,))
+    about = [] if not verdict.doubts else [f"{table.path}: {doubt}" for doubt in verdict.doubts]
+    others = [text for text in outcome.warnings if held.verdict.trusted or text not in held.warnings]
+    warnings = (*about, *others)
+    return dataclasses.replace(
+        outcome,
+        text=text,
+        warnings=warnings,
+        trusted=verdict.trusted,
+        next=(step,) if verdict.trusted else (),
+    )
 
 
 def stars_of(table: InputTable, held: Calibration, limit: float = math.inf) -> Catalogue:
@@ -187,6 +212,7 @@ def _apply_to_each(
     A table appears whole or not at all, and one that is there is not made again: the same command goes on with what an
     interrupted one has left. Errors of a file fail the whole, which names them, after all others are made.
     """
+    from walop_jax.io.text import some
     from walop_jax.likelihood.workers import executor_of, mapped
 
     if output is None:
@@ -211,11 +237,26 @@ def _apply_to_each(
     if existing := len(files) - len(calls):
         what = f"{existing} of {len(files)} tables were there already"
         warnings.append(f"{what}, and are left; --overwrite makes them again")
+    doubted = [str(o.content["output"]) for o in ended if not o.failure and not o.trusted]
+    made = {str(place) for _, place in pairs}
+    doubted += [str(place) for place in places if str(place) not in made and _is_doubted(place)]
     document = {"outputs": [str(place) for place in places], "made": len(ended) - len(failed)}
-    document |= {"left": existing, "failed": failed}
+    document |= {"left": existing, "failed": failed, "trusted": not doubted, "doubted": doubted}
     document["catalogues"] = [outcome.content for outcome in ended if not outcome.failure]
-    text = "\n".join(outcome.text for outcome in ended if outcome.text) or f"{output}: nothing was left to do"
-    return Outcome(places, document, text, warnings=list(dict.fromkeys(warnings)), failure="; ".join(failed))
+    verdict = (
+        f"{len(doubted)} of {len(places)} tables are NOT to be trusted: {some(doubted, 6)}" if doubted else ""
+    )
+    told = [outcome.text for outcome in ended if outcome.text] or [f"{output}: nothing was left to do"]
+    text = "\n".join(filter(None, (verdict, *told)))
+    about = list(dict.fromkeys(warnings))
+    return Outcome(places, document, text, warnings=about, failure="; ".join(failed), trusted=not doubted)
+
+
+def _is_doubted(place: Path) -> bool:
+    """True if a table that was made earlier says that it is not to be trusted; formats without a header say nothing."""
+    from walop_jax.data.user_tables import read_input_table
+
+    return read_input_table(place).table.meta.get("TRUSTED", True) in (False, "F", "False")
 
 
 def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:

@@ -350,7 +350,7 @@ class Less:
             return cls(matrix, left, right)
         return cls(matrix.whole, np.hstack([matrix.left, left]), np.hstack([matrix.right, right]))
 
-    def __getitem__(self, index: tuple[Any, Any]) -> Any:
+    def __getitem__(self, index: tuple[Any, ...]) -> Any:
         rows, columns = (np.ravel(at) if isinstance(at, np.ndarray) else at for at in index)
         return self.whole[index] - self.left[rows] @ self.right[columns].T
 

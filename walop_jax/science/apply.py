@@ -26,10 +26,14 @@ from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
+from walop_jax.science.catalogue_readings import Readings, readings_of, sample_of
+from walop_jax.science.catalogue_readings import Rows as ReadRows
+from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
 from walop_jax.science.instrument_changes import PossibleChange
 from walop_jax.science.left_over_sky import with_sky
+from walop_jax.science.own_light import OwnLight, OwnLightCheck, own_light_check, unpolarised
 from walop_jax.science.star_residuals import StarResiduals, by_place
 from walop_jax.sky.position_angles import sky_to_instrument
 
@@ -44,15 +48,14 @@ STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
 
+OWN_SAMPLE = 4096  # rows of which q and u of the stars themselves are asked: more show little more
 STAR_ROWS = 16384  # rows of a star catalogue that are worked on together: their matrices take some MB
 
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
-COOL, HOT = 3500.0, 10000.0
-"""Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
-_MOST_OF_TEFF = 0.5  # error of a TEFF, relative, that is propagated
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
 _STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
+_KNOWN = 0.1  # error of q and u together from which a star says nothing of the arms
 IMPROBABLE = 1e-6  # probability of a CHI2 as large below which FLAG 131072 is set, …
 ROUGH = 0.005
 """… with so much of the light added to the errors: calibrations and flat fields are less perfect than bright stars."""
@@ -102,15 +105,26 @@ def apply(
     calibration does not cover (`check_validity`).
     """
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
-    chosen = work.sample(STAR_SAMPLE)
-    blocks, watched = [], []
+    chosen, few = work.sample(STAR_SAMPLE), work.sample(OWN_SAMPLE)
+    readings = work.readings(chosen)
+    mended = readings is not None and bool(
+        readings.better
+    )  # what the stars say of the instrument means nothing then
+    blocks, watched, own = [], [], []
     for done, rows in work.blocks():
         block = work.block(rows)
         blocks.append(block.stars)
-        watched += work.residuals(block, chosen)
+        if not mended:
+            watched += work.residuals(block, chosen)
+            own += work.own_light(block, few)
         if progress is not None:
             progress(done, len(catalogue))
-    return with_sky(work.together(_joined(blocks), work.checked(watched, chosen)), catalogue)
+    check = dataclasses.replace(work.checked(watched, chosen), readings=readings, own=work.balanced(own))
+    if check.doubtful:
+        readings = work.readings(chosen, doubted=True)
+        if readings is not None and readings.better:
+            check = dataclasses.replace(NOTHING_TO_SPARE, readings=readings)
+    return with_sky(work.together(_joined(blocks), check), catalogue)
 
 
 def results_of(calibration: Calibration, catalogue: Catalogue) -> Stars:
@@ -165,7 +179,10 @@ class _Application:
         self.sigma = errors_of(calibration, self.counts, catalogue.sigma, *at)
         self.offset, self.slope = _rotator_zero(self.vectors)
         self.order = np.argsort(catalogue.star, kind="stable")
+        self.split = self.vectors.instrument.cameras.split
         self.on_sky = bool(np.isfinite(catalogue.rotator).any())
+        filters, of = np.unique(catalogue.points.settings.filter, return_inverse=True)
+        self.filter = filters[np.argmax(np.bincount(of.reshape(-1)))]
 
     def blocks(self) -> Iterator[tuple[int, Rows]]:
         """Rows of whole stars, each with the number of rows done after it."""
@@ -242,7 +259,7 @@ class _Application:
         spectrum, colour = nothing, np.zeros((len(rows), vectors.cameras, 2))
         teff_err = catalogue.teff_err[rows]
         if np.isnan(teff).any() or teff_err.any():
-            colour = np.stack([change_of(weights) for weights in _unsure_colour(teff, teff_err)], axis=-1)
+            colour = np.stack([change_of(weights) for weights in unsure_colour(teff, teff_err)], axis=-1)
             mean, width = (shift(colour[..., n]) for n in range(2))
             spectrum = mean[:, :, None] * mean[:, None] + width[:, :, None] * width[:, None]
         flag = self.flags(rows, used, first, fitted)
@@ -254,7 +271,7 @@ class _Application:
             calibration=calibration,
             spectrum=spectrum,
             changed=nothing,
-            colour=shift(change_of(_ignored_colour(teff))),
+            colour=shift(change_of(ignored_colour(teff))),
             hidden=hidden,
             chi2=fitted.chi2,
             dof=fitted.dof,
@@ -340,6 +357,57 @@ class _Application:
         )
         return [residuals]
 
+    def readings(self, chosen: Chosen, *, doubted: bool = False) -> Readings | None:
+        """Other readings of the rows of some bright ones of the chosen stars; `None` where nothing can be said."""
+        catalogue = self.catalogue
+        points, r = catalogue.points, np.flatnonzero(chosen[catalogue.star] & ~catalogue.copy)
+        r = r[np.argsort(catalogue.star[r], kind="stable")]
+        if not r.size:
+            return None
+        star = np.unique(catalogue.star[r], return_inverse=True)[1].reshape(-1)
+        rotator = catalogue.rotator[r] + np.rad2deg(self.offset)
+        place, settings = (points.x[r], points.y[r]), points.settings[r]
+        rows = sample_of(ReadRows(star, *place, rotator, self.counts[r], self.sigma[r], settings))
+        return readings_of(self.vectors, rows, doubted=doubted) if len(rows.x) else None
+
+    @property
+    def arms(self) -> list[tuple[int, int]]:
+        """The cameras of the arms that have two."""
+        return [(arm[0], arm[1]) for arm in self.vectors.instrument.cameras.arms if len(arm) == 2]
+
+    def own_light(self, block: _Block, chosen: Chosen) -> list[OwnLight]:
+        """q and u of the chosen stars of a block, with what moves them: none, or one list."""
+        catalogue, stars = self.catalogue, block.stars
+        first = np.flatnonzero(np.diff(block.star, prepend=-1))
+        row = block.rows[first]
+        beyond = Quality.BEYOND_FIELD | Quality.BEYOND_SETTINGS | Quality.NO_STOKES | Quality.REPEATED
+        good = chosen[catalogue.star[row]] & (stars.flag & (beyond | Quality.DISAGREES) == 0)
+        good &= catalogue.points.settings.filter[row] == self.filter
+        arms = self.arms
+        if not good.any() or not arms:
+            return []
+        light = unpolarised(
+            block.vectors, self.counts[block.rows], block.sigma, first, arms, split=self.split
+        )
+        with np.errstate(invalid="ignore"):
+            good &= np.trace(light.noise, axis1=1, axis2=2) < _KNOWN**2
+        colour = [
+            calibration_shift(block.found.gain, block.colour[..., n, None], block.star) for n in range(2)
+        ]
+        nuisances = np.concatenate(
+            [block.derivative[good] @ self.vectors.root, *(c[good] for c in colour)], axis=-1
+        )
+        _, group = np.unique(np.nan_to_num(np.round(catalogue.time, 3)), return_inverse=True)
+        place = catalogue.points.x[row], catalogue.points.y[row], group.reshape(-1)[row]
+        x, y, exposure = (values[good] for values in place)
+        return [OwnLight(light.qu[good], light.noise[good], x, y, exposure, light.shifts[good], nuisances)]
+
+    def balanced(self, parts: list[OwnLight]) -> OwnLightCheck | None:
+        """What q and u of the stars say of the balance of the arms; `None` of few stars."""
+        names = self.vectors.instrument.cameras.names
+        named = [(names[first], names[second]) for first, second in self.arms]
+        return own_light_check(OwnLight.joined(parts), named) if parts else None
+
     def checked(self, watched: list[StarResiduals], chosen: Chosen) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
 
@@ -350,7 +418,10 @@ class _Application:
         if not watched:
             return NOTHING_TO_SPARE
         vectors, names = self.vectors, self.vectors.instrument.cameras.names
-        search = CatalogueSearch(StarResiduals.joined(watched), names, vectors.named, vectors.root)
+        widths = [self.vectors.calibration.model[name].width for name, _ in vectors.named]
+        search = CatalogueSearch(
+            StarResiduals.joined(watched), names, vectors.named, vectors.root, widths=widths
+        )
         check = search.answer()
         for _ in range(_EXPANSIONS):
             errors = None if check.holds else search.errors_of_calibration()
@@ -365,14 +436,14 @@ class _Application:
             same = joined is not None and joined.residual.shape == search.stars.residual.shape
             if joined is None or (same and search.bend(errors, joined.residual) < _STRAIGHT):
                 break
-            search = CatalogueSearch(joined, names, vectors.named, vectors.root, errors)
+            search = CatalogueSearch(joined, names, vectors.named, vectors.root, errors, widths)
             check = search.answer()
         return check
 
     def together(self, stars: Stars, check: CatalogueCheck) -> Stars:
         """The stars with the errors, and a bit of FLAG, of the check of all of them."""
         changed, flag = stars.changed, stars.flag
-        if check.changes or check.places:
+        if check.changes or check.places or check.unbalanced:
             of_blocks = [self._changed(self.block(rows), check) for _, rows in self.blocks()]
             changed = np.concatenate([added for added, _ in of_blocks])
             flag = np.where(np.concatenate([near for _, near in of_blocks]), flag | Quality.PLACE, flag)
@@ -399,6 +470,16 @@ class _Application:
         for change in (*check.changes, *check.places):
             shifts = [np.abs(entry.size * np.nan_to_num(shift(entry))) for entry in change.alike]
             total += np.max(shifts, axis=0)[:, :, None] ** 2 * np.eye(2)
+        if check.unbalanced:
+            light = unpolarised(
+                block.vectors, self.counts[block.rows], block.sigma, first, self.arms, split=self.split
+            )
+            arms = [tuple(cameras[k] for k in arm) for arm in self.arms]
+            shifts = [
+                np.abs(c.size * np.nan_to_num(light.shifts[..., arms.index(c.cameras)]))
+                for c in check.unbalanced
+            ]
+            total += np.max(shifts, axis=0)[:, :, None] ** 2 * np.eye(2)
         near = np.zeros(len(total), bool)
         for spot in check.places:
             near |= np.maximum.reduceat(spot.profile(*place[:2]), first) > 0
@@ -421,29 +502,6 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
 def _rows_by_setting(setting_of: Rows) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
-
-
-def _ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
-    """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
-    flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
-    half = 0.5 * np.subtract(*colour_weights(np.array([COOL, HOT]), COLOURS))
-    return np.where(np.isnan(teff)[:, None], half, flat - colour_weights(teff, COLOURS))
-
-
-def _unsure_colour(
-    teff: Float[np.ndarray, " r"], error: Float[np.ndarray, " r"]
-) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Mixtures of spectra: mean of the possible colours of a star less the assumed one, and their deviation.
-
-    The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean of
-    the stars without TEFF, and in which a TEFF (K) has its `error`, (1/T) · error/T.
-    """
-    unknown, share = np.isnan(teff)[:, None], np.minimum(error / teff, _MOST_OF_TEFF)
-    hot, cool = colour_weights(np.array([HOT, COOL]), COLOURS)
-    flat = colour_weights(np.array([np.nan]), COLOURS)[0]
-    warmer, cooler = (colour_weights(teff / (1.0 + sign * share), COLOURS) for sign in (-1.0, 1.0))
-    deviation = np.where(unknown, 0.25 * (cool - hot), 0.5 * (cooler - warmer))
-    return np.where(unknown, 0.5 * (hot + cool) - flat, 0.0), deviation
 
 
 # ------------------------------------------------------------------------------------- settings and flags

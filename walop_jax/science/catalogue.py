@@ -17,6 +17,7 @@ from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
+from walop_jax.science.catalogue_doubts import about_values, field_against_sky, units_of_counts
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
@@ -39,7 +40,8 @@ class Catalogue:
     those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
     counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level subtracted
     (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
-    `remarks` name oddities of the table, and unused columns.
+    `remarks` name oddities of the table, and unused columns; `doubts` are about all of it: its results are not to be
+    trusted.
     """
 
     points: FieldPoints
@@ -54,6 +56,7 @@ class Catalogue:
     time: OfRows
     remarks: tuple[str, ...] = ()
     sky: Counts | None = None
+    doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.star)
@@ -117,8 +120,12 @@ def read_catalogue(
         (sky,) = user_tables.vector_columns(source, ("SKY",), rule, instrument.cameras.names)
         place.refuse(sky < 0, "is below 0", "SKY", "the level of the sky that was subtracted, in electrons")
     stated = str(source.table.meta.get("INSTRUME", instrument.name))
+    doubts = list(field_against_sky(source, points.x, points.y, rotator))
     if stated.upper() != instrument.name.upper():
-        source.remarks.append(f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
+        doubts.insert(0, f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
+    doubts += units_of_counts(np.where(bad, np.nan, counts), sigma)
+    names = instrument.cameras.names
+    source.remarks.extend(about_values(time, points.settings.temperature, counts, sigma, names))
     copy, repeated = _copies(source, instrument, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(
@@ -134,6 +141,7 @@ def read_catalogue(
         time=time,
         remarks=source.about(),
         sky=sky,
+        doubts=tuple(doubts),
     )
 
 

@@ -28,8 +28,10 @@ from scipy import special
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import star_residuals as residuals
+from walop_jax.science.catalogue_readings import DISAGREE, Readings
 from walop_jax.science.instrument_changes import InstrumentChange, PossibleChange, profile
 from walop_jax.science.left_over_sky import LeftOverSky
+from walop_jax.science.own_light import ArmChange, OwnLightCheck
 from walop_jax.science.places import DisagreeingPlace, places_of
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
 
@@ -78,7 +80,8 @@ class CatalogueCheck:
     one row, and `rows_p` its chance beside `noise`. `tests` are the `asked` questions in their first answer;
     `smallest` is the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and
     `rows_used` count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky`
-    is the light of the sky left over (None: its level is not stated).
+    is the light of the sky left over (None: its level is not stated), `readings` are other readings of the rows, and
+    `own` is what q and u of the stars say of the arms (None: of few stars).
     """
 
     stars: int
@@ -94,6 +97,26 @@ class CatalogueCheck:
     growth: Growth = IN_UNITS
     places: tuple[DisagreeingPlace, ...] = ()
     sky: LeftOverSky | None = None
+    readings: Readings | None = None
+    own: OwnLightCheck | None = None
+
+    @property
+    def unbalanced(self) -> tuple[ArmChange, ...]:
+        """Changes of the balance of an arm that the stars' own q and u show, those alike."""
+        return () if self.own is None else self.own.alike
+
+    @property
+    def misread(self) -> bool:
+        """True if another reading of the catalogue mends it."""
+        return self.readings is not None and bool(self.readings.better)
+
+    @property
+    def doubtful(self) -> bool:
+        """True where what the stars show is no plausible change of the instrument, or more than one explains."""
+        unlike = any(change.best.implausible for change in self.changes)
+        tried = self.readings is not None and self.readings.stands.disagree > DISAGREE
+        odd = unlike or self.places or self.noise_is_off or len(self.changes) > 1
+        return bool(odd) and not self.misread and not self.unbalanced and not tried
 
     @property
     def alarm(self) -> float:
@@ -128,15 +151,22 @@ class CatalogueCheck:
     @property
     def holds_elsewhere(self) -> bool:
         """True if calibration and errors stand but for some places in the field."""
-        return not (self.changes or self.noise_is_off or self.rows_agree)
+        off = self.changes or self.unbalanced or self.misread
+        return not (off or self.noise_is_off or self.rows_agree)
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
+        if self.readings is not None and self.readings.better:
+            return (self.readings.words(),)
         texts = [place.words() for place in self.places]
-        if any(change.best.implausible for change in self.changes):
+        if self.own is not None and self.own.found:
+            # Such a change moves the sums of the arms by second orders, which no change of its own explains.
+            plausible = [change.words() for change in self.changes if not change.best.implausible]
+            texts = [self.own.words(), *plausible, *texts]
+        elif any(change.best.implausible for change in self.changes):
             what = "the counts contradict the calibration by more than an instrument changes"
             question = "of this instrument, of all cameras in one unit and aperture, and in their order?"
-            texts.insert(0, f"{what}: are they {question}")
+            texts = [f"{what}: are they {question}"]  # what follows from it is no dust
         else:
             texts = [*(change.words() for change in self.changes), *texts]
         if self.sky is not None and self.sky.found:
@@ -174,6 +204,8 @@ class CatalogueCheck:
             "changes": [{"best": entry(c.best), "alike": [entry(e) for e in c.alike]} for c in self.changes],
             "places": [place.document() for place in self.places],
             "tests": [entry(test) for test in self.tests],
+            "readings": None if self.readings is None else self.readings.document(),
+            "own_light": None if self.own is None else self.own.document(),
             "sky": None if self.sky is None else self.sky.document(),
             "smallest_gain_seen": self.smallest if np.isfinite(self.smallest) else None,
             "warnings": list(self.warnings()),
@@ -189,7 +221,8 @@ class CatalogueSearch:
 
     `cameras` are names; `parameters` names and units of those of `stars.parameters()`, of which the first, as many as
     `stars.plain` has, are asked as well; `root` is a square root of their covariance, C = root rootᵀ. `at` are the
-    errors of the calibration, in units of `root`, with which `stars` were computed (None: none).
+    errors of the calibration, in units of `root`, with which `stars` were computed (None: none). `widths` are those of
+    the priors of the parameters (None: no prior; none given: not known).
     """
 
     def __init__(
@@ -199,6 +232,7 @@ class CatalogueSearch:
         parameters: Sequence[tuple[str, str]],
         root: Float[np.ndarray, "n n"],
         at: Float[np.ndarray, " n"] | None = None,
+        widths: Sequence[float | None] = (),
     ) -> None:
         self.stars = stars
         self.variance = residuals.own_variance(stars)
@@ -216,7 +250,11 @@ class CatalogueSearch:
         pairs = itertools.product(kinds, cameras)
         self.of_cameras = [PossibleChange(n, True, kind=k, unit=units.get(k, "")) for k, n in pairs]
         plain = stars.plain.shape[-1]
-        optics = (PossibleChange(name, False, kind="optics", unit=unit) for name, unit in parameters[:plain])
+        most = [alarms.FARTHEST * (width or np.inf) for width in (*widths, *[None] * plain)][:plain]
+        optics = (
+            PossibleChange(name, False, kind="optics", unit=unit, widest=widest)
+            for (name, unit), widest in zip(parameters[:plain], most, strict=True)
+        )
         self.questions = [*self.of_cameras, *optics]
         # Columns: those of the cameras, all parameters, two of the colours; from them questions and nuisances are made.
         count, shown, nuisances = len(self.of_cameras), len(root), self.root.shape[1]

@@ -15,11 +15,16 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.analysis_vectors import COLOURS, colour_weights
+
 DWARFS, GIANTS = (0.4929, 0.5092, -0.0353), (0.5323, 0.4775, -0.0344)
 LIMITS = (0.39, 1.50)
 SCATTER = 83.0  # K
 COLOUR_ERROR = 0.02  # mag, where a catalogue says nothing of it
 SOURCE = "Mucciarelli et al. 2021"
+COOL, HOT = 3500.0, 10000.0
+"""Colour temperatures (K) between which 95 % of the stars without TEFF are taken to lie, normal in 1/T."""
+_MOST_OF_TEFF = 0.5  # error of a TEFF, relative, that is propagated
 
 
 def temperature(colour: Float[np.ndarray, " n"], kind: tuple[float, float, float]) -> Float[np.ndarray, " n"]:
@@ -38,3 +43,26 @@ def temperature_of(
     mean = 0.5 * (dwarf + giant)
     slope = (temperature(colour + 0.01, DWARFS) - temperature(colour - 0.01, DWARFS)) / 0.02
     return mean, np.sqrt(SCATTER**2 + (0.5 * (dwarf - giant)) ** 2 + (slope * error) ** 2)
+
+
+def ignored_colour(teff: Float[np.ndarray, " r"]) -> Float[np.ndarray, "r c"]:
+    """Mixture of spectra that is the error of ignoring the colour (see `Stars.colour`)."""
+    flat = colour_weights(np.full(len(teff), np.nan), COLOURS)
+    half = 0.5 * np.subtract(*colour_weights(np.array([COOL, HOT]), COLOURS))
+    return np.where(np.isnan(teff)[:, None], half, flat - colour_weights(teff, COLOURS))
+
+
+def unsure_colour(
+    teff: Float[np.ndarray, " r"], error: Float[np.ndarray, " r"]
+) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
+    """Mixtures of spectra: mean of the possible colours of a star less the assumed one, and their deviation.
+
+    The effect of the colour is close to linear in 1/T, in which `COOL` and `HOT` lie two deviations from the mean of
+    the stars without TEFF, and in which a TEFF (K) has its `error`, (1/T) · error/T.
+    """
+    unknown, share = np.isnan(teff)[:, None], np.minimum(error / teff, _MOST_OF_TEFF)
+    hot, cool = colour_weights(np.array([HOT, COOL]), COLOURS)
+    flat = colour_weights(np.array([np.nan]), COLOURS)[0]
+    warmer, cooler = (colour_weights(teff / (1.0 + sign * share), COLOURS) for sign in (-1.0, 1.0))
+    deviation = np.where(unknown, 0.25 * (cool - hot), 0.5 * (cooler - warmer))
+    return np.where(unknown, 0.5 * (hot + cool) - flat, 0.0), deviation

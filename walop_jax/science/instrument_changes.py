@@ -19,7 +19,10 @@ from walop_jax.io.text import some, with_error, with_minus_sign
 
 ALARM = 1e-4  # probability that noise raises any alarm in a catalogue, or in all that are watched together
 RIVAL = 11.0
-LARGEST = 0.5  # relative change of a camera beyond which the counts are not those of the instrument
+LARGEST = 0.1  # relative change of a camera beyond which the counts are not those of the instrument
+FARTHEST = 10.0
+"""Widths of its prior by which a number of the optics may change: no optics moves farther, nor do first-order columns
+describe it there."""
 MOST_LIKELY = 2.33  # standard deviations above the alarm from which 99 % are detected (one-sided)
 REACH = 3.0  # sizes from the centre of a spot beyond which nothing is left of it
 Place = tuple[float, ...]  # centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge
@@ -75,7 +78,7 @@ class PossibleChange(NamedTuple):
     `kind` is gain (a camera), arm (its cameras together, NAME+NAME), gradient or spot (of a camera or an arm), optics,
     or `UNNAMED`; within one catalogue also x, y, time, flux and light of a camera. `place` is the direction of a
     gradient (deg, from X towards Y), whose size is that at the edge of the field, or centre, size (deg) and sharpness
-    of a spot (`profile`), whose size is that at its centre.
+    of a spot (`profile`), whose size is that at its centre. No number of the optics changes by more than `widest`.
     """
 
     name: str
@@ -86,6 +89,7 @@ class PossibleChange(NamedTuple):
     unit: str = ""
     kind: str = "gain"
     place: tuple[float, ...] = ()
+    widest: float = np.inf
 
     @property
     def members(self) -> tuple[str, ...]:
@@ -104,9 +108,9 @@ class PossibleChange(NamedTuple):
 
     @property
     def implausible(self) -> bool:
-        """True for a camera that would be brighter or fainter by more than cameras become."""
-        relative = self.kind in ("gain", "arm", "gradient", "x", "y", "time")
-        return self.camera and relative and abs(self.size) > LARGEST
+        """True for a change by more than cameras, or numbers of the optics, change."""
+        relative = self.camera and self.kind in ("gain", "arm", "gradient", "x", "y", "time")
+        return abs(self.size) > (LARGEST if relative else self.widest)
 
     def words(self) -> str:
         """The change and its size in words."""

@@ -9,16 +9,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.fit.verdict import Quality
+from walop_jax.io.text import in_ascii
 from walop_jax.model.instrument import Instrument
-from walop_jax.science.apply import COOL, HOT, Stars
+from walop_jax.science.apply import Stars
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import CatalogueCheck
+from walop_jax.science.catalogue_verdict import CatalogueVerdict
+from walop_jax.science.colours import COOL, HOT
 from walop_jax.science.overlaps import extents
 from walop_jax.science.polarisation import polarisation
 
-BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
 FEW = 0.5  # of the rows
-QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
 Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
@@ -60,8 +61,10 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     return {name: (values[star], about, units.get(name, "")) for name, (values, about) in columns.items()}
 
 
-def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -> dict[str, Any]:
-    """Cards of the output: the calibration (hash of its content), estimator, frame, colours, and the check."""
+def header(
+    product: str, estimator: str, on_sky: float, check: CatalogueCheck, verdict: CatalogueVerdict
+) -> dict[str, Any]:
+    """Cards of the output: the calibration (hash of its content), estimator, frame, colours, check and verdict."""
     frame = {0.0: "instrument", 1.0: "sky"}.get(on_sky, "sky where ROTATOR is given, else instrument")
     factors = np.sqrt(check.scale)
     return {
@@ -71,6 +74,8 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
         "POLCCONV": "IAU",
         "TIMESYS": "UTC",
         "COLOURS": f"without TEFF: half the difference of {COOL:g} and {HOT:g} K",
+        "TRUSTED": verdict.trusted,
+        **({"DOUBT": in_ascii(verdict.doubts[0])} if verdict.doubts else {}),
         "HOLDS": check.holds,
         "CHI2DOF": round(check.noise, 6),
         "PHOTFAC1": round(float(factors[0]), 6),
@@ -79,19 +84,14 @@ def header(product: str, estimator: str, on_sky: float, check: CatalogueCheck) -
 
 
 def sentences(rows: Catalogue, stars: Stars, names: Sequence[str]) -> Iterator[str]:
-    """Warnings about a catalogue: all stars, counts and errors, rows of other stars; `names` are of the cameras."""
-    at_places = {place.words() for place in stars.check.places}
-    for text in stars.check.warnings():
-        yield f"{text} (FLAG {Quality.PLACE if text in at_places else Quality.CATALOGUE:d})"
-    yield from about_counts(rows.counts, rows.sigma, names)
+    """Warnings about some rows of a catalogue: cameras that are hardly used, rows of other stars."""
+    yield from about_cameras(rows.counts, names)
     if number := int(((extents(rows) > APART) & (stars.flag & Quality.DISAGREES > 0)).sum()):
         yield f"{number} of the stars that disagree have rows at different places: is their ID that of one star?"
 
 
-def about_counts(
-    counts: Float[np.ndarray, "r k"], sigma: Float[np.ndarray, "r k"], names: Sequence[str]
-) -> Iterator[str]:
-    """Warnings about errors that are none of counts, and about cameras that are hardly used."""
+def about_cameras(counts: Float[np.ndarray, "r k"], names: Sequence[str]) -> Iterator[str]:
+    """Warnings about cameras that are hardly used."""
     used = np.isfinite(counts)
     if not used.any():
         yield "no row has a camera that is used: N is negative, flagged, saturated or NaN"
@@ -99,13 +99,6 @@ def about_counts(
         if used.any() and of_camera.mean() < FEW:
             what = "N is negative, flagged, saturated or NaN in the others"
             yield f"{name} is used in {int(of_camera.sum())} of {len(counts)} rows: {what}"
-    lit = used & (counts > 0)
-    if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
-        what = f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons"
-        yield f"{what}: is N in electrons? Magnitudes, rates and means of exposures are not"
-    bright = counts > BRIGHT
-    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
-        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted"
 
 
 def counted_flags(rows: Catalogue, instrument: Instrument) -> dict[Quality, str]:

@@ -16,12 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.science.instrument_changes import PossibleChange, profile
+from walop_jax.science.instrument_changes import FARTHEST, PossibleChange, profile
 from walop_jax.science.star_residuals import ROUNDING, StarResiduals
 
-FARTHEST = 10.0
-"""Widths of its prior by which a number of the optics may change: no optics moves farther, nor do first-order columns
-describe it there."""
 DIRECTIONS = 8
 """u √(π/2), by which χ² of two exceeds u² more often than one number does, at the highest alarm, u = 6.4."""
 Sum = dict[int, float]

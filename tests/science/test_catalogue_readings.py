@@ -1,0 +1,111 @@
+"""Mistakes of an observer in a catalogue: the one that was made is said; sound catalogues are quiet."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from star_tables import stars
+
+from walop_jax.data.settings import Settings
+from walop_jax.science.catalogue_readings import Readings, Rows, readings_of, turned
+
+ROTATOR = 35.0
+
+
+@pytest.fixture(scope="module")
+def sound(vectors) -> Rows:
+    """A hundred and fifty stars with the noise of photons, on the sky."""
+    table, _ = stars(vectors, 150, np.random.default_rng(3), teff=5500.0, rotator=(ROTATOR,))
+    settings = dataclasses.replace(Settings.default(150), teff=np.full(150, 5500.0))
+    place = np.array(table["X"]), np.array(table["Y"]), np.full(150, ROTATOR)
+    return Rows(np.arange(150), *place, np.array(table["N"]), np.array(table["N_ERR"]), settings)
+
+
+def first(vectors, rows, **options) -> str:
+    found = readings_of(vectors, rows, **options)
+    assert isinstance(found, Readings)
+    return found.words() if found.better else ""
+
+
+def ordered(rows: Rows, order) -> Rows:
+    return rows.changed(counts=rows.counts[:, order], sigma=rows.sigma[:, order])
+
+
+def placed(rows: Rows, x, y) -> Rows:
+    return rows.changed(x=x, y=y)
+
+
+def test_sound_catalogues_have_no_other_reading(vectors, sound):
+    """Neither as they are nor in doubt; nor with a camera that has become fainter by two per cent, or dust."""
+    assert first(vectors, sound) == first(vectors, sound, doubted=True) == ""
+    spot = 1.0 - 0.1 * np.exp(-((sound.x - 0.1) ** 2 + (sound.y - 0.05) ** 2) / 2 / 0.03**2)
+    for factor in (0.98, spot[:, None]):
+        fainter = sound.changed(counts=sound.counts * np.where(np.arange(4) == 1, factor, 1.0))
+        assert first(vectors, fainter) == ""
+
+
+@pytest.mark.parametrize(
+    "order", [(1, 0, 2, 3), (0, 1, 3, 2), (1, 0, 3, 2), (2, 3, 0, 1), (0, 2, 1, 3), (3, 0, 1, 2)]
+)
+def test_the_order_of_the_cameras(vectors, sound, order):
+    """The first three leave the sums of both arms as they were: only the q and u of the stars tell."""
+    names = vectors.instrument.cameras.names
+    held = ", ".join(names[k] for k in order)
+    assert f"if the columns of N and N_ERR were in the order {held} (" in first(
+        vectors, ordered(sound, list(order))
+    )
+
+
+def test_a_field_that_is_mirrored_or_turned(vectors, sound):
+    x, y = sound.x, sound.y
+    assert "if X and Y were exchanged (" in first(vectors, placed(sound, y, x))
+    assert "if X ran the other way (" in first(vectors, placed(sound, -x, y))
+    # X and Y of a ROTATOR of −35°: turned by −70° from those of 35°.
+    wrong = placed(sound, *turned(x, y, -2 * ROTATOR)).changed(rotator=-sound.rotator)
+    text = first(vectors, wrong)
+    assert "if ROTATOR had the wrong sign, 35° in place of −35° (" in text
+    radians = np.deg2rad(ROTATOR)
+    wrong = placed(sound, *turned(x, y, radians - ROTATOR)).changed(rotator=np.full(150, radians))
+    assert "if ROTATOR were in radians, 35° in place of 0.6109° (" in first(vectors, wrong)
+    wrong = placed(sound, *turned(x, y, 23.0))
+    text = first(vectors, wrong)
+    angle = float(text.partition("turned by ")[2].partition("°")[0].replace("−", "-"))
+    assert angle == pytest.approx(-23.0, abs=0.5)
+
+
+def test_turned_is_what_a_larger_rotator_does():
+    """X and Y of a direction east and north of the centre, by the definition of ROTATOR (docs: conventions)."""
+    east, north, r, more = 0.2, 0.1, np.deg2rad(20.0), np.deg2rad(50.0)
+    x, y = east * np.sin(r) + north * np.cos(r), east * np.cos(r) - north * np.sin(r)
+    later = east * np.sin(more) + north * np.cos(more), east * np.cos(more) - north * np.sin(more)
+    np.testing.assert_allclose(turned(np.array([x]), np.array([y]), 30.0), np.transpose([later]), atol=1e-15)
+
+
+def test_a_pointing_that_is_off(vectors, sound):
+    """By 0.06° east and 0.02° south; with +X 35° from north through east."""
+    r, east, north = np.deg2rad(ROTATOR), 0.06, -0.02
+    dx, dy = east * np.sin(r) + north * np.cos(r), east * np.cos(r) - north * np.sin(r)
+    text = first(vectors, placed(sound, sound.x - dx, sound.y - dy), doubted=True)
+    assert "west and" in text
+    assert "north of the one that was taken" in text
+    numbers = text.partition("stars lay at X ")[2].replace("−", "-")
+    found = float(numbers.partition("°")[0]), float(numbers.partition("Y ")[2].partition("°")[0])
+    np.testing.assert_allclose(found, (dx, dy), atol=0.003)
+
+
+def test_magnitudes_and_a_camera_in_another_unit(vectors, sound):
+    magnitudes = sound.changed(
+        counts=25.0 - 2.5 * np.log10(sound.counts), sigma=2.5 / np.log(10.0) * sound.sigma / sound.counts
+    )
+    assert "if N were magnitudes (" in first(vectors, magnitudes)
+    gain = np.array([1.0, 1.0, 0.85, 1.0])
+    weaker = sound.changed(counts=sound.counts * gain, sigma=sound.sigma * gain)
+    text = first(vectors, weaker)
+    assert "if N of O2 were 1.17" in text
+
+
+def test_few_stars_say_nothing(vectors, sound):
+    few = ordered(sound.of(sound.star < 7), [1, 0, 2, 3])
+    assert readings_of(vectors, few) is None

@@ -1,0 +1,158 @@
+"""Numbers of a catalogue that cannot be what they say: units, frames, dates, temperatures, errors, detectors.
+
+Doubts are about every star of it: nothing that is made of them is to be trusted. Remarks name rows and the likeliest
+cause. Neither asks the calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from time import time as time_now
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from walop_jax.data import user_tables
+from walop_jax.data.user_tables import InputTable
+from walop_jax.io.errors import rows_text
+from walop_jax.io.text import with_minus_sign
+from walop_jax.science.catalogue_readings import MIRRORED
+from walop_jax.sky.directions import Pointing
+
+OfRows = Float[np.ndarray, " n"]
+Counts = Float[np.ndarray, "n k"]
+
+BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
+OLDEST = 47892.0  # MJD of the year 1990, before which no such camera was read out
+_COLDEST, _HOTTEST = -60.0, 60.0  # Celsius, of an instrument that is used
+_TURNED = 1.0  # deg, by which ROTATOR may differ from what positions say: convergence of meridians
+_SCALE = 0.02  # by which the scale of X and Y may
+_POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
+"""Rows that are looked at, and needed; share of their extent by which positions of several fields scatter."""
+_REPEATED, _SHARE = 5, 0.01  # values that are the same maximum: rows of a camera, and their share, at least
+_WRAP = 65536.0  # of a counter of 16 bits
+_NEAR = 0.02
+_UNIX = 40587.0  # MJD of the epoch of Unix
+
+
+def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
+    """Sentences where errors are none of electrons, so that neither they nor the counts are what they should be."""
+    lit = np.isfinite(counts) & (counts > 0)
+    if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
+        what = f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons"
+        number = f"both would be those of photons if they were multiplied by {1.0 / share:.3g}"
+        yield (
+            f"{what}: is N in electrons? Magnitudes, rates and means of exposures are not; {number}, as rates of an "
+            "exposure of as many seconds, or a mean of as many exposures"
+        )
+    bright = counts > BRIGHT
+    if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
+        number = f"the root of N_ERR is {float(np.median(np.sqrt(sigma[bright] / counts[bright]))):.2g} times that of N"
+        yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted; {number}"
+
+
+def field_against_sky(source: InputTable, x: OfRows, y: OfRows, rotator: OfRows) -> Iterator[str]:
+    """Sentences where X, Y and ROTATOR contradict RA and DEC of the same table (docs: conventions).
+
+    Positions of one pointing are a linear map of those on the tangent plane, whose rotation and sign are known.
+    """
+    if not {"RA", "DEC"} <= set(source.names):
+        return
+    ra, dec = user_tables.sky_positions(source)
+    good = np.flatnonzero(np.isfinite(ra + dec + x + y + rotator))
+    good = good[:: max(1, len(good) // _POSITIONS)]
+    if len(good) < _FEWEST:
+        return
+    direction = np.exp(1j * np.deg2rad(rotator[good]))
+    middle = float(np.rad2deg(np.angle(direction.mean())))
+    if np.abs(np.angle(direction * np.exp(-1j * np.deg2rad(middle)))).max() > np.deg2rad(5.0):
+        return
+    centre = np.exp(1j * np.deg2rad(ra[good])).mean()
+    north, east = Pointing(
+        float(np.rad2deg(np.angle(centre))) % 360.0, float(dec[good].mean()), 0.0
+    ).field_of(ra[good], dec[good])
+    place, design = np.stack([x[good], y[good]], axis=1), np.stack([np.ones(len(good)), east, north], axis=1)
+    if np.linalg.matrix_rank(design) < 3 or not np.isfinite(design).all():
+        return
+    linear = np.linalg.lstsq(design, place, rcond=None)[0]
+    if float(np.std(place - design @ linear)) > _SPREAD * float(np.std(place)):
+        return  # several fields
+    turned, mirrored, scale = _turn(linear[1:].T)
+    stated = f"ROTATOR is {with_minus_sign(f'{middle:.4g}')}°"
+    if mirrored:
+        fitting = [m for m in MIRRORED if abs(_apart(_turn(_after(m[2], linear[1:].T))[0], middle)) < _TURNED]
+        reason = fitting[0] if fitting else ("the sign of X or of Y is the other one", "correct it")
+        yield f"X and Y are a mirror image of RA and DEC; they would fit if {reason[0]} ({reason[1]})"
+    elif abs(_apart(turned, middle)) > _TURNED:
+        causes = {"its sign": -middle, "are these radians": float(np.rad2deg(middle))}
+        named = [f": {name}?" for name, angle in causes.items() if abs(_apart(turned, angle)) < _TURNED]
+        what = f"{stated}, but RA, DEC, X and Y say {with_minus_sign(f'{turned:.4g}')}°"
+        yield f"{what}{named[0] if named else ''} Q, U and EVPA on the sky depend on it"
+    if abs(scale - 1.0) > _SCALE:
+        yield f"X and Y are {scale:.4g} times as far apart as RA and DEC: are they in degrees, with the right scale?"
+
+
+def _turn(linear: Float[np.ndarray, "2 2"]) -> tuple[float, bool, float]:
+    """ROTATOR (deg), whether the field is mirrored, and the scale of a map from (east, north) to (X, Y)."""
+    angle = float(np.rad2deg(np.arctan2(linear[0, 0] - linear[1, 1], linear[0, 1] + linear[1, 0])))
+    determinant = float(np.linalg.det(linear))
+    return angle, determinant > 0, float(np.sqrt(abs(determinant)))
+
+
+def _after(
+    turn: Callable[..., tuple[np.ndarray, np.ndarray]], linear: Float[np.ndarray, "2 2"]
+) -> Float[np.ndarray, "2 2"]:
+    return np.stack(turn(*linear))
+
+
+def _apart(one: float, other: float) -> float:
+    """The difference of two angles (deg), between −180 and 180."""
+    return (one - other + 180.0) % 360.0 - 180.0
+
+
+def about_values(
+    time: OfRows, temperature: OfRows, counts: Counts, sigma: Counts, names: Sequence[str]
+) -> Iterator[str]:
+    """Remarks on dates (MJD), temperatures (Celsius), errors and detectors that cannot be what they say."""
+
+    def in_rows(bad: Bool[np.ndarray, " n"]) -> str:
+        return rows_text(np.flatnonzero(bad))
+
+    now = time_now() / 86400.0 + _UNIX
+    for bad, what in (
+        (
+            time < OLDEST,
+            "is before 1990: is it JD − 2400000, a day of the year, or empty? MJD = JD − 2400000.5",
+        ),
+        (time > now + 1.0, "lies in the future: is it in UTC, MJD = JD − 2400000.5?"),
+    ):
+        if bad.any():
+            yield f"MJD {what} ({time[bad][0]:.10g} in {in_rows(bad)})"
+    bad = (temperature < _COLDEST) | (temperature > _HOTTEST)
+    if bad.any():
+        value = temperature[bad][0]
+        kelvin = (
+            f": {value:g} K would be {value - 273.15:.1f} Celsius" if value > 200.0 else ": is it in Celsius?"
+        )
+        yield f"TEMP is {value:g} Celsius in {in_rows(bad)}{kelvin}"
+    used = np.isfinite(counts) & np.isfinite(sigma)
+    for k, name in enumerate(names):
+        n, error, on = counts[:, k], sigma[:, k], used[:, k]
+        if on.sum() >= _REPEATED and np.all(error[on] > np.abs(n[on])):
+            yield f"N_ERR of {name} is larger than N in all rows: are the columns exchanged, or is it in another unit?"
+        if on.sum() >= _REPEATED and np.ptp(error[on]) == 0.0 and np.ptp(n[on]) > 0.0:
+            yield f"N_ERR of {name} is {error[on][0]:g} in all rows, whatever N is: is it a placeholder?"
+        top = on & (n == np.max(n[on], initial=-np.inf))
+        if top.sum() >= max(_REPEATED, _SHARE * on.sum()) and np.ptp(n[on]) > 0.0:
+            what = "a detector that is full, or an analogue-to-digital converter at its end"
+            yield f"N of {name} has the same largest value, {n[top][0]:g}, in {in_rows(top)}: {what}? See --saturation"
+        with np.errstate(invalid="ignore"):
+            wrapped = np.isfinite(n) & (n < -np.maximum(20.0 * np.nan_to_num(error), 0.25 * _WRAP))
+            below = np.isfinite(n) & (n <= -1.0) & (np.abs(n + 0.5 * _WRAP) < _NEAR * _WRAP)
+        if (wrapped | below).any():
+            bad = wrapped | below
+            what = (
+                "counts of 16 bits that were read with a sign (add 65536), or a background that is too large"
+            )
+            yield f"N of {name} is far below 0 ({n[bad][0]:g}) in {in_rows(bad)}: {what}?"
