@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data import user_tables
+from walop_jax.data import plausible, user_tables
 from walop_jax.data.repeats import equal_rows
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.units import Place
@@ -76,8 +76,9 @@ def read_catalogue(
     *,
     always_in: Collection[str] = (),
     never_in: Collection[str] = (),
+    filters: Collection[str] = (),
 ) -> Catalogue:
-    """The catalogue in a table of an instrument; `always_in` and `never_in` as for `field_points`.
+    """The catalogue in a table of an instrument; `always_in`, `never_in` and `filters` as for `field_points`.
 
     Counts from `saturation` [electron] on, or below −5 σ, are not used.
 
@@ -85,10 +86,8 @@ def read_catalogue(
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
-    points, cameras = (
-        field_points(source, instrument, always_in, never_in, everywhere=False),
-        len(instrument.cameras),
-    )
+    points = field_points(source, instrument, always_in, never_in, everywhere=False, filters=filters)
+    cameras = len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = user_tables.vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     points, teff_err = _with_colours(source, points, place)
@@ -119,6 +118,13 @@ def read_catalogue(
     stated = str(source.table.meta.get("INSTRUME", instrument.name))
     if stated.upper() != instrument.name.upper():
         source.remarks.append(f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
+    about = {"MJD": time, "TEMP": points.settings.temperature}
+    doubts = [*plausible.of_columns(about, plausible.today())]
+    doubts += plausible.of_angles("ROTATOR", rotator, radians=False)
+    unflagged = np.asarray(~bad.any(axis=1))
+    doubts += plausible.of_ceilings(counts, unflagged, instrument.cameras.names)
+    doubts += plausible.of_wraps(counts, sigma, cameras=instrument.cameras.names)
+    source.remarks.extend(f"{column} {what}" for column, what in doubts)
     copy, repeated = _copies(source, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(
