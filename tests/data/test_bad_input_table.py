@@ -98,7 +98,7 @@ row("20", "two polariser angles", "E", "at least 3")(angles(0.0, 90.0, 0.0, 90.0
 row("21", "angles within 30°", "F", "all polariser angles lie within")(angles(0.0, 6.0, 12.0, 18.0, 24.0))
 row("23", "a point outside the field", "E", "[POINTS] Y: lies outside ±0.35°")(put(P, "Y", 1, 0.4))
 row("27", "no instrument", "E", "[PRIMARY] INSTRUME")(lambda made: made.header.pop("INSTRUME"))
-row("27", "an unknown filter", "E", "[EXPOSURES] FILTER: 'SDSS-R'")(put(E, "FILTER", 2, "SDSS-R"))
+row("27", "an unknown filter", "E", "[EXPOSURES] FILTER: 'SDSS-i'")(put(E, "FILTER", 2, "SDSS-i"))
 row("32", "text in a column of numbers", "E", "holds strings")(
     columns(P, X=["4A", None, np.array(["1", "b", "2"])])
 )

@@ -123,7 +123,8 @@ def test_optional_columns_may_be_absent(handmade):
     assert np.all(np.isnan(calset.exposures.teff))
     assert not np.any(calset.exposures.position("CHWP").inside)
     assert set(calset.exposures.filter.tolist()) == {"SDSS-r"}
-    assert len(calset.remarks) == 3  # one for each value that is used instead; an element may be absent
+    # One for each value that is used instead, an element may be absent; and the curve that nothing uses now.
+    assert len(calset.remarks) == 4
     unknown = "[EXPOSURES] EXPTIME, TEMP, HA, TEFF: columns missing; using nan"
     assert any(unknown in remark for remark in calset.remarks)
 

@@ -273,6 +273,30 @@ def test_neighbours_and_blends_are_used_and_marked_unless_it_is_asked_for(tmp_pa
     assert "left out" in said
 
 
+def test_stars_in_another_spelling_of_the_filter_are_of_it(calibration, caplog):
+    stars = walop.simulate(seed=3, stars=20)
+    whole = walop.apply(calibration, stars)
+    stars["FILTER"] = "sdss r"
+    caplog.clear()
+    with caplog.at_level("WARNING", logger="walop_jax"):
+        made = walop.apply(calibration, stars)
+    assert "FILTER 'sdss r' is taken as 'SDSS-r'" in caplog.text
+    np.testing.assert_array_equal(made["Q"], whole["Q"])
+
+
+def test_a_night_that_cannot_be_is_named_in_catalogues_and_tables(tmp_path, caplog, calibration):
+    _, said = gathered(caplog, files_with(tmp_path, {**CENTRE, "MJD": 40587.0, "TEMP": 85.0}))
+    assert "MJD is 40587 in row 0 (counted from 0): a clock that was not set (1970)?" in said
+    assert "TEMP is 85 Celsius" in said
+    stars = walop.simulate(seed=3, stars=20)
+    stars["MJD"], stars["N"][:5, 1] = 40587.0, 4e6
+    caplog.clear()
+    with caplog.at_level("WARNING", logger="walop_jax"):
+        walop.apply(calibration, stars)
+    assert "MJD is 40587" in caplog.text
+    assert "N is exactly 4000000, the largest, in rows 0, 1, 2, 3, 4 (counted from 0) of E1" in caplog.text
+
+
 def test_stars_without_a_place_in_a_table_have_no_result_and_are_named(calibration, caplog):
     stars = walop.simulate(seed=3, stars=30)
     whole = walop.apply(calibration, stars)

@@ -174,7 +174,8 @@ def stars_of(table: InputTable, held: Calibration, limit: float = math.inf) -> C
     from walop_jax.science.catalogue import read_catalogue
 
     instrument = held.model.template.patched()
-    return read_catalogue(table, instrument, limit, always_in=held.always_in, never_in=held.never_in)
+    moved = {"always_in": held.always_in, "never_in": held.never_in}
+    return read_catalogue(table, instrument, limit, **moved, filters=tuple(held.filters))
 
 
 def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Sequence[str]]:

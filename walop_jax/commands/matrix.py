@@ -71,7 +71,7 @@ def matrix(
     columns |= {name: value for name, value in (("TEFF", teff), ("FILTER", filter)) if value is not None}
     table = table_of({"X": x, "Y": y} if points is None else points, columns)
     never = [prefix for prefix in held.never_in if f"{prefix}_ANGLE" not in columns]
-    places = field_points(table, instrument, held.always_in, never)
+    places = field_points(table, instrument, held.always_in, never, filters=tuple(held.filters))
     if points is None and places.outside.all():
         what = f"beyond the field of {instrument.name} (±{instrument.field_limit:g}°)"
         raise fail(what, column="X, Y", advice="give degrees; are these arcmin?")

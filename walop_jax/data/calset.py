@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data import checks, schema
+from walop_jax.data import checks, plausible, schema
 from walop_jax.data.celestial import ICRS, made_icrs
 from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
 from walop_jax.data.hdus import filter_columns
@@ -86,6 +86,7 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     if images and opened.compressed:
         raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
     tables = {}
+    remarks += _unused_words(opened, hdus)
     for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
         place = Place(path, name)
         if name in hdus:
@@ -138,14 +139,18 @@ def assembled(
     remarks = list(remarks)
     instrument = checks.instrument_name(instrument, Place(path, "PRIMARY"))
     filters = checks.make_filters(tables["FILTERS"], Place(path, "FILTERS")) if "FILTERS" in tables else {}
+    tables = {name: dict(columns) for name, columns in tables.items()}
+    filters, spelled = checks.match_filters(tables, filters, path)
+    remarks += spelled
     place = Place(path, "EXPOSURES")
     exposures = checks.make_exposures(tables["EXPOSURES"], filters, site, place, kinds)
-    remarks += checks.doubts_about(instrument, site, exposures, place)
+    remarks += checks.doubts_about(instrument, site, exposures, place, origin)
     sources = Sources.none()
     if "SOURCES" in tables:
         sources = checks.make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
-        intensities, points = _frames(images, exposures, instrument, path)
+        intensities, points, odd = _frames(images, exposures, instrument, path)
+        remarks += odd
     else:
         points = checks.make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
         place = Place(path, "INTENSITIES")
@@ -153,6 +158,10 @@ def assembled(
         intensities, odd = table_intensities(tables["INTENSITIES"], exposures, points, sources, place)
         intensities, repeated = mask_repeats(intensities, exposures, path)
         remarks += odd + repeated
+        rows = intensities.exposure
+        numbers = intensities.counts, intensities.sigma, intensities.used
+        doubts = plausible.of_counts(*numbers, measured=~exposures.flux_known[rows], group=rows)
+        remarks += [place.remark(what, column) for column, what in doubts]
         idle = np.setdiff1d(np.arange(len(exposures)), intensities.exposure[intensities.used])
         if len(idle):
             names = ", ".join(map(str, exposures.exposure[idle][:5])) + (" …" if len(idle) > 5 else "")
@@ -161,6 +170,9 @@ def assembled(
     if compression is not None:
         remarks.append(remark(compression, len(points)))
     used = np.unique(exposures.filter).tolist()
+    if idle_curves := [name for name in filters if name not in {*used, *sources.filter.tolist()}]:
+        what = f"the curve of {', '.join(idle_curves)} is used by no exposure (FILTER is {', '.join(used)} there)"
+        remarks.append(Place(path, "FILTERS").remark(f"{what}; correct the name, or remove it", "FILTER"))
     return CalibrationSet(
         instrument=instrument,
         site=site,
@@ -195,6 +207,24 @@ def _header(header: Any, path: Path) -> tuple[str, Site]:
             raise place.fail(f"is {value!r}, not a number", name, "degrees (east positive) and metres")
         values.append(float(value))
     return instrument, Site(str(header.get("TELESCOP", "")).strip(), *values)
+
+
+def _unused_words(opened: OpenFile, tables: Mapping[str, Any]) -> Iterator[str]:
+    """Remark on words of headers that have the name of a column of EXPOSURES, which alone is read."""
+    columns = (
+        schema.column_names(tables["EXPOSURES"], Place(opened.path, "EXPOSURES"))
+        if "EXPOSURES" in tables
+        else ()
+    )
+    for extension in ("PRIMARY", *schema.TABLES):
+        header = (
+            opened.hdus[0].header if extension == "PRIMARY" else getattr(tables.get(extension), "header", {})
+        )
+        for name in schema.EXPOSURES:
+            if name in header:
+                there = "that column counts" if name in columns else "write a column of EXPOSURES"
+                what = f"= {header[name]} in the header is not used: {there}"
+                yield Place(opened.path, extension).remark(what, name)
 
 
 def _in_icrs(table: dict[str, Any], headers: Iterable[Any], place: Place) -> list[str]:
@@ -249,8 +279,8 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
 
 def _frames(
     images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
-) -> tuple[Intensities, Points]:
-    """Describe frames, and check a few rows of pixels for faults of the whole."""
+) -> tuple[Intensities, Points, list[str]]:
+    """Describe frames, and check a few rows of pixels for faults of the whole; doubts about these."""
     if np.any(bad := exposures.direct("standard")):
         what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
         advice = "give standards in a table, in another file"
@@ -266,11 +296,16 @@ def _frames(
     sampled = [int(row) for row in np.unique(np.linspace(0, grid.height - 1, _SAMPLE).astype(int))]
     spoilt = number = 0
     lowest, highest = np.inf, -np.inf
+    remarks, photons = dict[str, None](), ~exposures.flux_known
     for row in sampled:
         counts, sigma, flag = intensities.read(stack, row * width, (row + 1) * width)
         used, bad, _ = usable(counts, sigma, flag)
         intensities.block(row * width, (row + 1) * width)  # refuses errors that are not positive
         spoilt, number = spoilt + int(bad.sum()), number + bad.size
+        lit = (used & photons).ravel()
+        cameras = intensities.cameras
+        doubts = plausible.of_errors(counts.reshape(-1, cameras), sigma.reshape(-1, cameras), lit)
+        remarks |= dict.fromkeys(f"{path} [E0…E{last}]: {what}" for _, what in doubts)
         if np.any(used):
             values = counts[used]
             lowest, highest = min(lowest, values.min()), max(highest, values.max())
@@ -279,7 +314,7 @@ def _frames(
         raise place.fail(what, f"N0…N{last}, E0…E{last}", "repair the reduction, or set the FLAG image")
     if lowest == highest and number > 1:
         raise place.fail(f"all counts are equal ({lowest:g})", f"N0…N{last}", "these are not measurements")
-    return intensities, grid.points
+    return intensities, grid.points, list(remarks)[:1]
 
 
 NAME = "arrays"

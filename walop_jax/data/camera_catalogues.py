@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.data import plausible
 from walop_jax.data.camera_headers import (
     LDAC_OBJECTS,
     OF_EXPOSURES,
@@ -179,6 +180,11 @@ def read_camera_catalogue(
         source.remarks.append(f"{int(bad.sum())} of {len(bad)} {what}")
     if low := int(np.sum(flux < -_NEGATIVE * error)):
         source.remarks.append(f"{low} of {len(bad)} fluxes are below 0 by more than {_NEGATIVE:g} errors")
+    doubts = [*plausible.of_columns(_numbers(of_exposure), plausible.today())]
+    doubts += plausible.of_counts(flux[:, None], error[:, None], ~bad & (flag == 0), cameras=["this camera"])
+    pair = _pair(source, column_map.flux)
+    names = {"N": pair[0], "N_ERR": pair[1]}
+    source.remarks.extend(f"{names.get(column, column)} {what}" for column, what in doubts)
     located = np.flatnonzero(np.isfinite(ra) & np.isfinite(dec))
     numbers = np.stack([ra, dec, flux, error])[:, located]
     rows = located[np.sort(np.unique(numbers, axis=1, return_index=True)[1])]
@@ -209,6 +215,12 @@ def time_of(of_exposure: Mapping[str, Any]) -> float:
         return float(of_exposure.get("MJD") or np.nan)
     except (TypeError, ValueError):
         return float("nan")
+
+
+def _numbers(of_exposure: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The numbers among the values of an exposure, as columns of one row."""
+    plain = {name: value for name, value in of_exposure.items() if isinstance(value, int | float | np.number)}
+    return {name: np.array([value], float) for name, value in plain.items() if not isinstance(value, bool)}
 
 
 def _table(path: Path) -> tuple[InputTable, Headers]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+import itertools
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.data import plausible
 from walop_jax.data.kinds import KINDS, POLARISER, WAVELENGTHS
 from walop_jax.data.records import Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, TURN, check
-from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, single_wavelength
+from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, same_filters, single_wavelength
 from walop_jax.data.units import Place
 from walop_jax.instruments.description import described, shipped
 from walop_jax.io.errors import nearest, rows_text
@@ -81,6 +84,36 @@ def make_filters(table: dict[str, Any], place: Place) -> dict[str, FilterCurve]:
             raise place.fail(f"{name!r} is there twice, again{where}", "FILTER", "rename one")
         curves[name] = checked_curve(name, wavelengths[row], throughputs[row], place, where)
     return curves
+
+
+def match_filters(
+    tables: dict[str, dict[str, Any]], filters: dict[str, FilterCurve], file: object
+) -> tuple[dict[str, FilterCurve], list[str]]:
+    """Give names of filters that differ in case, blanks and dashes alone one spelling; the curves, and remarks.
+
+    A curve counts before a built-in one, whose name it gets. FILTER of EXPOSURES and SOURCES is changed in place.
+    Raises `DataError` where several curves could be meant.
+    """
+    place, remarks, curves = Place(file, "FILTERS"), list[str](), dict(filters)
+    for table in ("EXPOSURES", "SOURCES"):
+        used = tables.get(table, {}).get("FILTER", np.zeros(0, "U1"))
+        exact = set(used.tolist())
+        for name in sorted(exact - set(curves) - {""}):
+            alike = same_filters(name, curves)
+            if len(alike) > 1:
+                listed = " and ".join(map(repr, alike))
+                raise place.fail(f"{listed} may be {name} of {table}", "FILTER", "rename all but one of them")
+            built_in = same_filters(name, BUILTIN_FILTERS)
+            if alike and built_in and alike[0] not in exact:
+                curves[name] = dataclasses.replace(curves.pop(alike[0]), name=name)
+                remarks.append(place.remark(f"the curve {alike[0]!r} is taken as that of {name}", "FILTER"))
+                continue
+            to = next(iter(alike or built_in), name)
+            if to != name:
+                wide = np.array(used, f"U{max(used.dtype.itemsize // 4, len(to))}")
+                used = tables[table]["FILTER"] = np.where(used == name, to, wide)
+                remarks.append(Place(file, table).remark(f"{name!r} is taken as {to!r}", "FILTER"))
+    return curves, remarks
 
 
 def checked_curve(
@@ -174,7 +207,7 @@ def make_exposures(
     advice = "one at a time: their angles go together, which is not stated"
     place.refuse(several, "another element turns as well", column, advice)
     angles = np.unique(table["CLP_ANGLE"][clp_in])
-    if like_radians(angles):
+    if plausible.like_radians(angles):
         what = f"all {len(angles)} different angles lie between {angles[0]:g} and {angles[-1]:g}"
         raise place.fail(what, "CLP_ANGLE", "angles are in degrees: are these radians?")
     angles_of = {f"{prefix}_ANGLE": EXPOSURES["CLP_ANGLE"] for prefix in moving}
@@ -204,28 +237,18 @@ def _site(site: Site, place: Place, *, needed: bool) -> None:
             raise Place(place.file, "PRIMARY").fail(what, name, "the Moon's parallax needs the site")
 
 
-def like_radians(angles: np.ndarray) -> bool:
-    """True if angles are clearly radians, not degrees.
-
-    Clearly: five or more, from more than a quarter of a turn in radians, none beyond a turn, and most of
-    them off the round numbers that anyone would choose in degrees.
-    """
-    distinct = np.unique(angles)
-    if len(distinct) < 5 or distinct[0] < -2 * np.pi or distinct[-1] > 2 * np.pi + 1e-6:
-        return False
-    steps = distinct / 0.05
-    off = np.mean(np.abs(steps - np.round(steps)) > 1e-3)
-    return bool(distinct[-1] - distinct[0] > 0.5 * np.pi and off > 0.5)
-
-
 _NEAR = 0.05  # degrees between two statements of one site
 _LEVEL = 100.0  # metres
-_OLDEST = 48000.0  # MJD: 1990, before which no such camera was read out
-_CAMPAIGN = 400.0  # days
 
 
-def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place) -> Iterator[str]:
-    """Sentences on a site that is not that of a shipped instrument, and on dates that cannot be those of one campaign.
+SIMULATED = "walop-jax simulate"
+"""Begin of the ORIGIN of simulated sets, which may be of the future."""
+
+
+def doubts_about(
+    instrument: str, site: Site, exposures: Exposures, place: Place, origin: str = ""
+) -> Iterator[str]:
+    """Sentences on a site that is not that of a shipped instrument, and on numbers of exposures that cannot be meant.
 
     None of it forbids a fit: an instrument may have been moved, and MJD matters to few of its exposures.
     """
@@ -233,17 +256,11 @@ def doubts_about(instrument: str, site: Site, exposures: Exposures, place: Place
         yield from _about_site(instrument, site, place)
     elif like := difflib.get_close_matches(instrument.upper(), shipped(), 1, _LIKE):
         yield f"{place.file} [PRIMARY] INSTRUME: is {instrument!r}, not shipped; did you mean {like[0]!r}?"
-    where = f"{place.file} [EXPOSURES] MJD"
-    dated = np.flatnonzero(np.isfinite(exposures.mjd))
-    if not len(dated):
-        return
-    mjd = exposures.mjd[dated]
-    if np.any(old := mjd < _OLDEST):
-        yield f"{where}: is before 1990 in {rows_text(dated[old])}; write NaN where the time is not known"
-    middle = np.median(mjd)
-    if np.any(far := np.abs(mjd - middle) > _CAMPAIGN):
-        what = f"is more than {_CAMPAIGN:g} days from the median, {middle:.1f}, in {rows_text(dated[far])}"
-        yield f"{where}: {what}; correct it, or calibrate the epochs one by one"
+    now = np.inf if origin.startswith(SIMULATED) else plausible.today()
+    for column, what in itertools.chain(
+        plausible.of_columns(exposures.columns(), now), plausible.of_campaign(exposures.mjd)
+    ):
+        yield f"{place.file} [EXPOSURES] {column}: {what}"
 
 
 def _about_site(instrument: str, site: Site, place: Place) -> Iterator[str]:

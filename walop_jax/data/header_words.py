@@ -33,6 +33,7 @@ MODES = ("manual", "auto")
 LONGEST = 100  # characters of a fact
 MJD_1970 = 40587.0
 TOLERATED = 2.0 / 86400.0  # d: times are of whole seconds
+_JSON, _FITS = {".json", ".jsonl"}, {".fits", ".fit", ".fts", ".gz", ".fz"}
 _MOVES = re.compile(r"[A-Z][A-Z0-9_]*_(IN|ANGLE|TURN)")
 _INSIDE: Mapping[str, bool] = {
     **dict.fromkeys(("t", "true", "1", "in"), True),
@@ -132,6 +133,11 @@ def exposures_table(
     table = columns_of(rows, ", ".join(dict.fromkeys(file for file, _ in records)))
     absent = [name for name in EXPOSURES if name not in there and not _MOVES.fullmatch(name)]
     remarks = [f"no word for {', '.join(absent)}: taken as not known"] if absent else []
+    suffixes = {Path(path).suffix.lower() for path in paths}
+    if words.rows and not suffixes & _JSON:
+        remarks.append(f"rows = {words.rows!r} of the words is not used: no file is JSON")
+    if words.extension and not suffixes & _FITS:
+        remarks.append(f"extension = {words.extension} of the words is not used: no file is FITS")
     for frame in dict.fromkeys(filter(None, converted)):
         remarks.append(f"RA and DEC of {converted.count(frame)} exposures are in {frame}: converted to ICRS")
     if through:
@@ -196,9 +202,9 @@ def _plain(header: Mapping[str, Any]) -> dict[str, Any]:
 def _records(path: Path, words: Words, content: Any) -> Iterator[Mapping[str, Any]]:
     """The words of every exposure in a file: one of a FITS file, one for each record or row of others."""
     suffix = path.suffix.lower()
-    if suffix in (".json", ".jsonl"):
+    if suffix in _JSON:
         yield from _of_json(path, words.rows, json_content(path) if content is None else content)
-    elif suffix in (".fits", ".fit", ".fts", ".gz", ".fz"):
+    elif suffix in _FITS:
         from astropy.io import fits
 
         try:

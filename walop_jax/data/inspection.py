@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.checks import like_radians
 from walop_jax.data.kinds import CALIBRATION_PLATE
+from walop_jax.data.plausible import like_radians
 from walop_jax.data.records import CalibrationSet, DataFlag, Exposures, sampled
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.instruments.description import shipped

@@ -24,6 +24,7 @@ from walop_jax.data.records import (
     StatedErrors,
 )
 from walop_jax.data.repeats import mask_repeats, repeated_counts
+from walop_jax.data.settings import same_filters
 from walop_jax.data.table_intensities import TableIntensities, empty_block
 from walop_jax.io.errors import DataError, fail
 
@@ -278,6 +279,9 @@ def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:
     filters: dict[str, FilterCurve] = {}
     for entry in sets:
         for name, curve in entry.filters.items():
+            if (alike := same_filters(name, filters)) and name not in filters:
+                what = f"{name!r} is {alike[0]!r} in an earlier file"
+                raise _conflict(what, entry, "FILTERS", "spell the name of a filter alike in all files")
             old = filters.setdefault(name, curve)
             same = np.array_equal(old.wavelength, curve.wavelength)
             if not (same and np.array_equal(old.throughput, curve.throughput)):

@@ -108,7 +108,13 @@ EXPOSURES: Mapping[str, Column] = {
     "CLP_ANGLE": _ANGLE,
     "CHWP_IN": Column("bool", missing=False),
     "CHWP_ANGLE": _ANGLE,
-    "TEMP": _number("Celsius", within(150.0, "temperatures are in degrees Celsius: are these kelvin?")),
+    "TEMP": _number(
+        "Celsius",
+        within(
+            150.0,
+            "temperatures are in degrees Celsius: are these kelvin? Write NaN where it is not known (999)",
+        ),
+    ),
     "HA": _number("h", within(24.0, "hour angles are in hours: are these degrees?")),
     "RA": _number("deg", within(360.0, "right ascensions are in degrees")),
     "DEC": _number("deg", within(90.0, "declinations are in degrees")),

@@ -39,6 +39,27 @@ def single_wavelength(name: str) -> float | None:
     return None if match is None else 1e-4 * float(match[1])
 
 
+_BETWEEN = re.compile(r"[\s_-]+")
+_TELLING = 3  # letters from which on case tells nothing: R and r are two filters
+
+
+def same_filters(name: str, names: Iterable[str]) -> list[str]:
+    """Those of `names` that are one name with `name`: itself; else all that differ in case, blanks and dashes alone.
+
+    Of names with fewer than three letters and digits case counts.
+
+    >>> same_filters("sdss r", ["SDSS-r", "SDSS-i"]), same_filters("r", ["R"])
+    (['SDSS-r'], [])
+    """
+    known = list(dict.fromkeys(map(str, names)))
+    return [name] if name in known else [other for other in known if _letters(other) == _letters(name)]
+
+
+def _letters(name: str) -> str:
+    plain = _BETWEEN.sub("", name)
+    return plain.lower() if len(plain) >= _TELLING else plain
+
+
 def builtin_filter(name: str) -> FilterCurve:
     """Return a built-in filter curve by name; wavelength in µm.
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.data.schema import MISSING, undefined
+from walop_jax.data.schema import EXPOSURES, MISSING, undefined
 from walop_jax.io.errors import DataError, fail, rows_text
 from walop_jax.io.fits_reading import UNREADABLE, one_line, open_fits, unpacked
 from walop_jax.io.plain_tables import table_format
@@ -28,6 +28,8 @@ _CLASSES = bytes.maketrans(b'123456789,;\t|\n" ', b"ddddddddd" + b"s" * 7)  # di
 _LOOKED_AT = 200  # lines, for their separators of decimals
 _NUMBER = re.compile(r"[+-]?\d[\d.,]*([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+_OF_PRIMARY = (*EXPOSURES, "INSTRUME", "RADESYS", "RADECSYS", "EQUINOX", "MJD-OBS", "DATE-OBS")
+"""Words of a primary header that say something of a table behind it."""
 _SCALES = ("UTC", "TAI", "TT", "TDB", "TCB", "TCG", "UT1")
 
 
@@ -131,9 +133,20 @@ def _from_fits(path: Path, extension: str, needed: Collection[str]) -> tuple[Any
             raise fail(what, file=path, advice=f"name one: {path.name}[{labels[chosen[0]]}]")
         hdu = tables[chosen[0]]
         table = table_of_hdu(hdu)
+        _add_words(table, opened.hdus[0].header, path)
     unread = [label for n, label in labels.items() if n != chosen[0]]
     remark = f"the table {labels[chosen[0]]} is read, not {some(unread, 5)}"
     return table, (remark,) if unread and not extension else ()
+
+
+def _add_words(table: Any, primary: Any, path: Path) -> None:
+    """Add the words of the primary header that a table may need and has not, to its own, which count before them."""
+    own = {str(key).upper(): value for key, value in table.meta.items()}
+    one, other = (str(words.get("INSTRUME", "")).strip() for words in (own, primary))
+    if one and other and one.upper() != other.upper():
+        what = f"is {one} in the header of the table and {other} in the primary header"
+        raise fail(what, file=path, column="INSTRUME", advice="correct the one that is wrong")
+    table.meta.update({name: primary[name] for name in _OF_PRIMARY if name in primary and name not in own})
 
 
 def table_of_hdu(hdu: Any) -> Any:

@@ -84,6 +84,9 @@ class InputTable:
             sentences.append(f"{renamed[0]} of the table is {self.new_name(renamed[0])} in the result")
         if gone := [name for name in replaced if name not in self.used]:
             sentences.append(f"{_columns(gone)} replaced by the result")
+        header = {str(key).upper(): value for key, value in self.table.meta.items()}
+        for name in sorted(self.lacking & set(header) - set(self.names)):
+            sentences.append(f"{name} = {header[name]} of the header is not used: give a column {name}")
         if unused:
             about = some(self.hints(self.lacking, unused), 3, "; ")
             sentences.append(f"{_columns(unused)} not used{f' ({about})' if about else ''}")

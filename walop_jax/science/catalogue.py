@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from walop_jax.data import user_tables
+from walop_jax.data import plausible, user_tables
 from walop_jax.data.repeats import equal_rows
 from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_column
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
 from walop_jax.model.instrument import Instrument
-from walop_jax.science.catalogue_doubts import about_values, field_against_sky, units_of_counts
+from walop_jax.science.catalogue_doubts import errors_of_cameras, field_against_sky, units_of_counts
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
@@ -79,8 +79,9 @@ def read_catalogue(
     *,
     always_in: Collection[str] = (),
     never_in: Collection[str] = (),
+    filters: Collection[str] = (),
 ) -> Catalogue:
-    """The catalogue in a table of an instrument; `always_in` and `never_in` as for `field_points`.
+    """The catalogue in a table of an instrument; `always_in`, `never_in` and `filters` as for `field_points`.
 
     Counts from `saturation` [electron] on, or below −5 σ, are not used.
 
@@ -88,10 +89,8 @@ def read_catalogue(
     above 0, a ROTATOR that only some rows of a star have.
     """
     place = Place(source.path, "")
-    points, cameras = (
-        field_points(source, instrument, always_in, never_in, everywhere=False),
-        len(instrument.cameras),
-    )
+    points = field_points(source, instrument, always_in, never_in, everywhere=False, filters=filters)
+    cameras = len(instrument.cameras)
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = user_tables.vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     points, teff_err = _with_colours(source, points, place)
@@ -125,7 +124,15 @@ def read_catalogue(
         doubts.insert(0, f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
     doubts += units_of_counts(np.where(bad, np.nan, counts), sigma)
     names = instrument.cameras.names
-    source.remarks.extend(about_values(time, points.settings.temperature, counts, sigma, names))
+    columns, unflagged = {"MJD": time, "TEMP": points.settings.temperature}, np.asarray(~bad.any(axis=1))
+    odd = [
+        *plausible.of_columns(columns, plausible.today()),
+        *plausible.of_angles("ROTATOR", rotator, radians=False),
+        *plausible.of_ceilings(counts, unflagged, names),
+        *plausible.of_wraps(counts, sigma, cameras=names),
+    ]
+    source.remarks.extend(f"{column} {what}" for column, what in odd)
+    source.remarks.extend(errors_of_cameras(counts, sigma, names))
     copy, repeated = _copies(source, instrument, points, counts, sigma, rotator, star)
     bad |= copy[:, None]
     return Catalogue(

@@ -1,20 +1,19 @@
-"""Numbers of a catalogue that cannot be what they say: units, frames, dates, temperatures, errors, detectors.
+"""Numbers of a catalogue that cannot be what they say: units of counts, errors of cameras, frames of the positions.
 
-Doubts are about every star of it: nothing that is made of them is to be trusted. Remarks name rows and the likeliest
-cause. Neither asks the calibration.
+Doubts are about every star of it: nothing that is made of them is to be trusted. Remarks name the likeliest cause.
+Neither asks the calibration. Dates, temperatures and detectors are looked at as those of calibration sets are
+(`data.plausible`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from time import time as time_now
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from walop_jax.data import user_tables
 from walop_jax.data.user_tables import InputTable
-from walop_jax.io.errors import rows_text
 from walop_jax.io.text import with_minus_sign
 from walop_jax.science.catalogue_readings import MIRRORED
 from walop_jax.sky.directions import Pointing
@@ -24,16 +23,10 @@ Counts = Float[np.ndarray, "n k"]
 
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
 QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
-OLDEST = 47892.0  # MJD of the year 1990, before which no such camera was read out
-_COLDEST, _HOTTEST = -60.0, 60.0  # Celsius, of an instrument that is used
 _TURNED = 1.0  # deg, by which ROTATOR may differ from what positions say: convergence of meridians
 _SCALE = 0.02  # by which the scale of X and Y may
 _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
 """Rows that are looked at, and needed; share of their extent by which positions of several fields scatter."""
-_REPEATED, _SHARE = 5, 0.01  # values that are the same maximum: rows of a camera, and their share, at least
-_WRAP = 65536.0  # of a counter of 16 bits
-_NEAR = 0.02
-_UNIX = 40587.0  # MJD of the epoch of Unix
 
 
 def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
@@ -111,48 +104,12 @@ def _apart(one: float, other: float) -> float:
     return (one - other + 180.0) % 360.0 - 180.0
 
 
-def about_values(
-    time: OfRows, temperature: OfRows, counts: Counts, sigma: Counts, names: Sequence[str]
-) -> Iterator[str]:
-    """Remarks on dates (MJD), temperatures (Celsius), errors and detectors that cannot be what they say."""
-
-    def in_rows(bad: Bool[np.ndarray, " n"]) -> str:
-        return rows_text(np.flatnonzero(bad))
-
-    now = time_now() / 86400.0 + _UNIX
-    for bad, what in (
-        (
-            time < OLDEST,
-            "is before 1990: is it JD − 2400000, a day of the year, or empty? MJD = JD − 2400000.5",
-        ),
-        (time > now + 1.0, "lies in the future: is it in UTC, MJD = JD − 2400000.5?"),
-    ):
-        if bad.any():
-            yield f"MJD {what} ({time[bad][0]:.10g} in {in_rows(bad)})"
-    bad = (temperature < _COLDEST) | (temperature > _HOTTEST)
-    if bad.any():
-        value = temperature[bad][0]
-        kelvin = (
-            f": {value:g} K would be {value - 273.15:.1f} Celsius" if value > 200.0 else ": is it in Celsius?"
-        )
-        yield f"TEMP is {value:g} Celsius in {in_rows(bad)}{kelvin}"
+def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> Iterator[str]:
+    """Remarks on errors of a camera (electrons) that are larger than its counts in all rows, or a placeholder."""
     used = np.isfinite(counts) & np.isfinite(sigma)
     for k, name in enumerate(names):
         n, error, on = counts[:, k], sigma[:, k], used[:, k]
-        if on.sum() >= _REPEATED and np.all(error[on] > np.abs(n[on])):
+        if on.sum() >= _FEWEST and np.all(error[on] > np.abs(n[on])):
             yield f"N_ERR of {name} is larger than N in all rows: are the columns exchanged, or is it in another unit?"
-        if on.sum() >= _REPEATED and np.ptp(error[on]) == 0.0 and np.ptp(n[on]) > 0.0:
+        if on.sum() >= _FEWEST and np.ptp(error[on]) == 0.0 and np.ptp(n[on]) > 0.0:
             yield f"N_ERR of {name} is {error[on][0]:g} in all rows, whatever N is: is it a placeholder?"
-        top = on & (n == np.max(n[on], initial=-np.inf))
-        if top.sum() >= max(_REPEATED, _SHARE * on.sum()) and np.ptp(n[on]) > 0.0:
-            what = "a detector that is full, or an analogue-to-digital converter at its end"
-            yield f"N of {name} has the same largest value, {n[top][0]:g}, in {in_rows(top)}: {what}? See --saturation"
-        with np.errstate(invalid="ignore"):
-            wrapped = np.isfinite(n) & (n < -np.maximum(20.0 * np.nan_to_num(error), 0.25 * _WRAP))
-            below = np.isfinite(n) & (n <= -1.0) & (np.abs(n + 0.5 * _WRAP) < _NEAR * _WRAP)
-        if (wrapped | below).any():
-            bad = wrapped | below
-            what = (
-                "counts of 16 bits that were read with a sign (add 65536), or a background that is too large"
-            )
-            yield f"N of {name} is far below 0 ({n[bad][0]:g}) in {in_rows(bad)}: {what}?"

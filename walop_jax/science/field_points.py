@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.data.schema import EXPOSURES, TURN, Column, check, finite
-from walop_jax.data.settings import TEMPERATURE, Settings, nearest_hours
+from walop_jax.data.settings import TEMPERATURE, Settings, nearest_hours, same_filters
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable, empty_cells, numeric_column, read_input_table
 from walop_jax.io.errors import rows_text
@@ -68,6 +68,7 @@ def field_points(
     never_in: Collection[str] = (),
     *,
     everywhere: bool = True,
+    filters: Collection[str] = (),
 ) -> FieldPoints:
     """The X, Y and optional settings of a table of field points of an instrument.
 
@@ -76,6 +77,7 @@ def field_points(
     those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of the calibration, are in it
     only where `<P>_IN` says so. Single points outside the field are marked; if most of them lie outside, the unit must
     be wrong. Unless a place is needed `everywhere`, points without one are marked as well, with a remark.
+    `filters` are names that are known, in whose spelling FILTER is returned.
 
     Raises `DataError` naming file, column and row for anything that cannot be meant.
     """
@@ -91,6 +93,7 @@ def field_points(
         x, y = (np.where(lost, 0.0, values) for values in (x, y))
     needed = POINT_COLUMNS if everywhere or lost.all() else {n: POINT_COLUMNS[n] for n in SETTINGS}
     check(columns, needed, place)
+    columns["FILTER"] = _as_known(columns["FILTER"], filters, source)
     moving = instrument.moving()
     missing = [prefix for prefix in moving if prefix in always_in and f"{prefix}_ANGLE" not in source.names]
     if missing:
@@ -136,6 +139,18 @@ def field_points(
     columns["HA"] = nearest_hours(columns["HA"])
     stated = (columns[name] for name in ("FILTER", "TEFF", "TEMP", "HA"))
     return FieldPoints(x, y, Settings(*stated, positions=positions, turns=turns), outside | lost)
+
+
+def _as_known(names: np.ndarray, known: Collection[str], source: InputTable) -> np.ndarray:
+    """Names of filters in the spelling that is known, where there is one that differs in case, blanks, dashes alone."""
+    for name in np.unique(names).tolist():
+        same = same_filters(name, known)
+        if len(same) == 1 and same[0] != name:
+            names = np.where(
+                names == name, same[0], names.astype(f"U{max(names.dtype.itemsize // 4, len(same[0]))}")
+            )
+            source.remarks.append(f"FILTER {name!r} is taken as {same[0]!r}")
+    return names
 
 
 def doubt_radians(source: InputTable, name: str, angle: Float[np.ndarray, " n"], place: Place) -> None:
