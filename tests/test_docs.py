@@ -252,7 +252,7 @@ SCHEMAS = json.loads((ROOT / "walop_jax/docs/schemas.json").read_text(encoding="
 WRITTEN = {
     "summary.json": ("walop_jax.calibration.summary", "summary"),
     "diagnosis.json": ("walop_jax.diagnosis.findings", "document"),
-    "plan.json": ("walop_jax.plans.plan", "document"),
+    "plan.json": ("walop_jax.plans.exposure_plan", "document"),
 }
 
 

@@ -17,7 +17,7 @@ from walop_jax.paper import comparison
 from walop_jax.paper import polynomial as paper
 from walop_jax.science import star_errors as accuracy
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import _catalogue, _without_light, simulate
 
 ANGLES = np.arange(15) * 12.0
 
@@ -176,7 +176,14 @@ def test_a_set_without_enough_angles_is_refused_before_the_joint_fit(monkeypatch
         raise AssertionError("the joint model was fitted, in vain")
 
     monkeypatch.setattr("walop_jax.fit.refit.refit", fit)
-    calset = simulate(ObservingPlan(grid=2, moon_patches=0, standards=0, **plan)).calset
+    observing, rng = (
+        ObservingPlan(grid=2, moon_patches=0, standards=0, unpolarised=0, **plan),
+        np.random.default_rng(0),
+    )
+    blank = _without_light(observing, _catalogue(observing, rng)[0], 0, 4)
+    counts = rng.uniform(1e4, 2e4, np.shape(blank.intensities.counts))
+    lit = dataclasses.replace(blank.intensities, counts=counts, sigma=np.sqrt(counts))
+    calset = dataclasses.replace(blank, intensities=lit)
     with pytest.raises(DataError, match=message):
         walop.compare(calset)
 

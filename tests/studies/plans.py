@@ -411,10 +411,13 @@ def naming() -> None:
         cheapest, _ = least_budget(start, criterion.variance(NAMED))
         needed = cost_of(start, cheapest) / 60
         minutes, plan = needed, None
+        had = dataclasses.replace(
+            available.plan, stops=stops_of(found, standard), patches=(), stars=()
+        ).exposures()
         while plan is None or plan.value < NAMED:
             minutes = 1.25 * minutes + 0.2
             with contextlib.suppress(ValueError):  # too little for a single exposure
-                plan = plan_from(found, minutes, criterion, known=before_of(found, standard))
+                plan = plan_from(found, minutes, criterion, known=before_of(found, standard), had=(had,))
         names = [named(found, standard, plan.observing_plan, pair, seed) for seed in range(2 * INSTRUMENTS)]
         print(
             f"{pair[0]} against {pair[1]}: standard plan {at_first:.2f} σ apart; {NAMED:.2g} σ after {needed:.2f} min, "

@@ -79,15 +79,24 @@ def _directions(found: Candidates, planned: Required, had: Sequence[Exposures]) 
         if angle is not None and len(_distinct(angles)) < FEW_ANGLES and _is_new(angle, angles):
             angles.append(angle)
             wanted[number, place] = 1.0
-    plain = min(indoors, key=lambda i: (*_plates(indoors[i]), indoors[i].seconds, i))
-    turn = indoors[plain].turn
-    while len(_distinct(angles)) < FEW_ANGLES or (
-        turn > _DIRECTION and _widest(angles, turn)[1] > _DIRECTION
-    ):
-        begin, gap = _widest(angles, turn)
-        angles.append(round(float((begin + 0.5 * gap) % turn), 3))
-        wanted[plain, indoors[plain].place(angles[-1])] = 1.0
+    plain = indoors[number := min(indoors, key=lambda i: (*_plates(indoors[i]), indoors[i].seconds, i))]
+    while len(_distinct(angles)) < FEW_ANGLES:
+        begin, gap = _widest(angles, _DIRECTION)
+        middle = round(float((begin + 0.5 * gap) % _DIRECTION), 3)
+        # Where half a turn later is another exposure the one that is farther from all others spreads them over a turn.
+        angles.append(
+            max((middle, middle + plain.turn - _DIRECTION), key=lambda angle: _farthest(angle, angles))
+        )
+        wanted[number, plain.place(angles[-1])] = 1.0
+    begin, gap = _widest(angles, 360.0)
+    if gap > _DIRECTION and plain.turn > _DIRECTION:
+        wanted[number, plain.place(round(float((begin + 0.5 * gap) % 360.0), 3))] = 1.0
     return wanted
+
+
+def _farthest(angle: float, among: Sequence[float]) -> float:
+    """Distance (deg) from the nearest of some angles in a whole turn."""
+    return min((abs((angle - other + 180.0) % 360.0 - 180.0) for other in among), default=360.0)
 
 
 def _plates(choice: CandidateExposure) -> tuple[bool, ...]:
