@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from walop_jax.io.text import beside, per_cent, per_cent_range, probability, two_digits_range, with_error
+from walop_jax.io.text import (
+    beside,
+    in_its_unit,
+    per_cent,
+    per_cent_range,
+    probability,
+    two_digits_range,
+    with_error,
+)
 
 
 @pytest.mark.parametrize(
@@ -59,3 +67,7 @@ def test_rounding_noise_is_no_result():
     assert per_cent_range(0.0016, 0.0019) == "0.16 … 0.19"
     assert per_cent_range(0.0, 0.0) == "0"
     assert per_cent_range(float("nan"), 1.0) == ""
+
+
+def test_a_missing_unit_leaves_no_blank():
+    assert [in_its_unit("0.5", unit) for unit in ("um", "")] == ["0.5 um", "0.5"]

@@ -53,6 +53,11 @@ def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str
     return with_minus_sign(f"{round(value, places) + 0.0:.{shown}f}"), f"{round(sigma, places):.{shown}f}"
 
 
+def in_its_unit(number: str, unit: str) -> str:
+    """A number as text with its unit, and without a blank behind it where it has none."""
+    return f"{number} {unit}".rstrip()
+
+
 def date_of(mjd: float) -> str:
     """The calendar date (UTC) of a Modified Julian Date: 2026-06-29."""
     return (datetime.datetime(1858, 11, 17) + datetime.timedelta(days=float(mjd))).date().isoformat()
