@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,11 @@ def test_quality_bits_follow_the_fit(result):
     bad = dataclasses.replace(result, minimum=minimum, expansion=expansion, values=values)
     assert bad.judged().verdict.quality == 1 | 2 | 4 | 8 | 8192
     assert bad.at_prior_edge == ("pupil.magnification",)
+    values = result.values.copy()
+    values[result.model.index("half1.efficiency")] += 0.05  # a number without a unit
+    warnings = dataclasses.replace(result, values=values).judged().verdict.warnings
+    (edge,) = (text for text in warnings if text.startswith("half1.efficiency"))
+    assert re.fullmatch(r"half1\.efficiency = \S+ lies \S+ prior widths from \S+", edge)
     slightly = dataclasses.replace(result.expansion, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
     assert (
         dataclasses.replace(result, expansion=slightly).judged(["odd"]).verdict.quality & ~8 == 8192 | 32768

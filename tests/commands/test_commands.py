@@ -274,6 +274,21 @@ def test_inspect_names_what_is_wrong(call, calset_file, tmp_path):
     assert sets[0]["points"] == 29
 
 
+def test_inspect_shows_files_that_contradict_each_other_before_it_says_so(call, calset_file, tmp_path):
+    """Two instruments: each file is listed by itself, then one line says why they cannot be one."""
+    with fits.open(calset_file) as hdus:
+        hdus[0].header["INSTRUME"] = "WALOP-NORTH"
+        hdus.writeto(tmp_path / "north.fits", checksum=True)
+    result = call("inspect", calset_file, tmp_path / "north.fits")
+    assert result.exit_code == 1
+    assert "WALOP-SOUTH" in result.stdout
+    assert "WALOP-NORTH" in result.stdout
+    assert "these files cannot be fitted as one set" in one_line(result)
+    told = json.loads(call("inspect", calset_file, tmp_path / "north.fits", "--json").stdout)
+    assert [one["points"] for one in told["sets"]] == [29, 29]
+    assert told["joint"] is None
+
+
 def test_model_is_a_file_that_refit_takes(call, calset_file, tmp_path):
     text = call("model", calset_file, "--effect", "clp_zero").stdout
     table = tomllib.loads(text)

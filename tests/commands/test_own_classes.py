@@ -136,7 +136,7 @@ def test_what_is_fitted_with_an_element_of_ones_own_is_read(own: Path, call):
         "import walop_jax as walop\n"
         "try:\n    walop.read('RUN').calibration\n"
         "except walop.DataError as error:\n    print(error)\n"
-        "held = walop.read('RUN', elements='grey.py')['grey.loss']\n"
+        "held = walop.Calibration.read('RUN', elements='grey.py')['grey.loss']\n"
         "print(held.value)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}

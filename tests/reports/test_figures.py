@@ -70,10 +70,18 @@ def test_a_change_is_shown_in_per_cent(fitted):
     figure = figures.matrix_change_figure(maps, dataclasses.replace(maps, values=maps.values + step))
     images = [axis.images[0] for axis in figure.axes[:6]]
     for image, change, far in zip(
-        images, (0.1, 0.0, 0.0, 0.0, -0.35, 0.0), (0.1, 1.0, 0.5, 0.1, 0.5, 1.0), strict=True
+        images, (0.1, 0.0, 0.0, 0.0, -0.35, 0.0), (0.1, 1.0, 1.0, 1.0, 0.5, 1.0), strict=True
     ):
         np.testing.assert_allclose(image.get_array(), change, atol=1e-10)
         assert image.get_clim() == (-far, far)
+    small = np.array([0.001, 2e-5, 4e-5, 0.0, -0.0035, 0.006])[
+        :, None, None
+    ]  # beside large ones of their names
+    figure = figures.matrix_change_figure(maps, dataclasses.replace(maps, values=maps.values + small))
+    assert [figure.axes[k].images[0].get_clim()[1] for k in (1, 2)] == pytest.approx([0.002, 0.005])
+    noise = np.array([0.001, 1e-15, 0.0, 0.0, 0.0, 0.0])[:, None, None]
+    figure = figures.matrix_change_figure(maps, dataclasses.replace(maps, values=maps.values + noise))
+    assert figure.axes[1].images[0].get_clim()[1] == pytest.approx(1e-5)  # not blown up to a pattern
     half = dataclasses.replace(maps.grid, matrix=((0.01, 0.0), (0.0, 0.01)))
     with pytest.raises(ValueError, match="different places"):
         figures.matrix_change_figure(maps, dataclasses.replace(maps, grid=half))

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from walop_jax.reports.posterior_figures import MOST_IN_CORNER, SHARES, corner_figure, correlated
+from walop_jax.reports.posterior_figures import (
+    MOST_IN_CORNER,
+    SHARES,
+    corner_figure,
+    correlated,
+    label,
+    trace_figure,
+)
 
 NAMES, UNITS = ("half1.wedge", "sky.depolarisation", "noise.ln_f"), ("deg", "", "")
 
@@ -32,6 +39,22 @@ def test_contours_hold_their_share_of_the_draws(draws: np.ndarray):
         # Smoothing widens them a little.
         np.testing.assert_allclose(inside, SHARES[::-1], atol=0.05)
         assert np.all(inside > np.array(SHARES[::-1]) - 0.01)
+
+
+def test_symbols_have_a_key():
+    """Every symbol of a figure is explained by the name that the tables print beside the numbers."""
+    names, units = ("sky.depolarisation", "half2.wedge", "own.number"), ("", "deg", "")
+    chains = np.random.default_rng(0).standard_normal((2, 20, 4, 3))
+    keys = [f"{label(name)}: {name}" for name in names[:2]]
+    trace = trace_figure(chains, names, units, 2, np.full(3, 5.0))
+    assert [text.get_text() for axes in trace.axes for text in axes.texts[-1:]] == [*keys, ""]
+    corner = corner_figure(chains.reshape(-1, 3), names, units)
+    (key,) = corner.texts
+    assert key.get_text().splitlines() == keys
+    corner.draw_without_rendering()
+    box = key.get_window_extent()
+    drawn = [axes.get_window_extent() for axes in corner.axes if axes.get_frame_on()]
+    assert not any(box.overlaps(other) for other in drawn)
 
 
 def test_every_panel_shows_its_coefficients(draws: np.ndarray):

@@ -97,6 +97,13 @@ def test_what_must_be_made_again_is_named(old, table):
     found = walop.affected(old, new, [table, reduced])
     first, second = found.nights[:2]
     assert found.again == ("catalogue 1", "catalogue 2")
+    first = found.nights[0]
+    quiet = dataclasses.replace(
+        found, limit=0.5, nights=(first._replace(most=0.4, largest=0.61, again=False),)
+    )
+    assert "nothing: nowhere do more than 5 % of the stars of a night shift by more than 0.5" in str(quiet)
+    near = dataclasses.replace(found, limit=0.5, nights=(first._replace(most=0.5004),))
+    assert "0.5004" in str(near)  # not 0.50 beside a limit of 0.5
     assert [night.most for night in found.nights[:2]] == pytest.approx([n.most for n in found.nights[2:]])
     assert first.median > found.limit
     assert first.u == pytest.approx(-moved_by, rel=0.05)

@@ -101,7 +101,7 @@ def test_nights_are_added_once_and_replaced(row, tmp_path: Path):
     assert remarks == ["N2: this calibration is in the table already"]
     table, remarks = append(file, table_of_nights([night(row, 2, CALHASH="again", RUN="B")]), limits)
     assert table["RUN"].tolist() == ["N1", "B", "N3"]
-    assert remarks == ["B: takes the place of N2 in night 61222.0"]
+    assert remarks == ["B: takes the place of N2 in night 61222"]
     assert Table.read(file)["ANGLE"].unit == "deg"
 
 
@@ -204,6 +204,11 @@ def test_the_figure_shows_every_night(row):
     figure = quality_figure(table, read_limits())
     assert len(figure.axes) == 6
     assert figure.axes[0].get_xlim()[1] > 61224.0 - 40587  # days since 1970
+    figure.draw_without_rendering()
+    q, u = (container.lines[0] for container in figure.axes[2].containers)
+    at = [line.get_transform().transform(line.get_xydata()) for line in (q, u)]
+    aside = at[1][:, 0] - at[0][:, 0]
+    assert np.all(aside > q.get_markersize() * figure.dpi / 72.0)  # neither hides the other
     undated = judge(table_of_nights([night(row, k, NIGHT=np.nan) for k in range(2)]), read_limits())
     quality_figure(undated, read_limits()).draw_without_rendering()
 

@@ -290,10 +290,16 @@ class Calibration(Contents, Fitted):
         return self.model.template
 
     @staticmethod
-    def read(path: PathLike) -> Calibration:
-        """The calibration of a product, or of the folder of a run. Raises `DataError` for what cannot be read."""
-        from walop_jax.calibration.product import read_calibration
+    def read(path: PathLike, elements: PathLike | Sequence[type] | None = None) -> Calibration:
+        """The calibration of a product, or of the folder of a run. Raises `DataError` for what cannot be read.
 
+        `elements` are kinds of elements of one's own that its instrument has: a Python file, or classes.
+        """
+        from walop_jax.calibration.product import read_calibration
+        from walop_jax.model.elements.registry import load_elements
+
+        if elements is not None:
+            load_elements(elements)
         return read_calibration(path)
 
     def display(self) -> Display:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrices
 from walop_jax.data.settings import Settings
-from walop_jax.io.text import rounded, two_digits
+from walop_jax.io.text import per_cent, rounded
 from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light
 from walop_jax.model.effects import Change, Effect, EffectKind, effect_by_name, in_order
@@ -74,10 +74,10 @@ def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
     return {", ".join(mistake.name for mistake in group): group[0] for group in together.values()}
 
 
-def off_by(median: float, largest: float) -> str:
-    """Errors of q and u over the field in words; `largest` may be unknown (NaN)."""
-    worst = f", {two_digits(100 * largest)} % at worst" if np.isfinite(largest) else ""
-    return f"q or u off by {two_digits(100 * median)} % (median{worst})"
+def off_by(median: float, largest: float, shown: str = "") -> str:
+    """Errors of q and u over the field in words; `largest` may be unknown (NaN), `shown` replaces the median (%)."""
+    worst = f", {per_cent(largest)} % at worst" if np.isfinite(largest) else ""
+    return f"q or u off by {shown or per_cent(median)} % (median{worst})"
 
 
 def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from walop_jax.io.text import two_digits, with_error, with_minus_sign
+from walop_jax.io.text import per_cent, with_error, with_minus_sign
 
 
 class MatrixTable(Table):
@@ -48,7 +48,7 @@ class MatrixTable(Table):
         rows = (cells[k : k + 3] for k in range(0, len(cells), 3))
         lines += ["  " + "".join(f"{cell:<{width}}" for cell in row) for row in rows]
         if "P_ERR" in self.colnames:
-            error_of_p, flag = f"{two_digits(100 * number('P_ERR'))} %", int(number("FLAG"))
+            error_of_p, flag = f"{per_cent(number('P_ERR'))} %", int(number("FLAG"))
             lines.append(f"  error of p of a star with p ≤ 5 %, calibration alone: {error_of_p}; FLAG {flag}")
             lines += [f"  FLAG {bit}: {meaning}" for bit, meaning in self.meanings.items() if flag & bit]
         return "\n".join(line.rstrip() for line in lines)

@@ -17,8 +17,7 @@ def inspect(job: Job, data: Sets) -> Outcome[InspectedSets]:
 
     Each file by itself; then whether they can be fitted as one. Exit code 1 if any cannot be read or fitted.
 
-    In Python: an `InspectedSets`. Raises `DataError` only if the sets cannot be one: errors of a single file are
-    among its faults.
+    In Python: an `InspectedSets`; errors of a single file, and contradictions between files, are among its `faults`.
 
     >>> walop.inspect("night.fits").faults
     ()

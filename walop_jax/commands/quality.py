@@ -13,8 +13,13 @@ from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.io.atomic import check_output
 from walop_jax.io.display import Display
 from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import rounded, with_error
 
-SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
+SHOWN = {
+    "CHI2DOF": (1.0, ""), "ANGLE": (1.0, "deg"), "P_RATIO": (1.0, ""), "ZERO_Q": (100.0, "%"), "ZERO_U": (100.0, "%"),
+    "ACCURACY": (100.0, "%"),
+}  # fmt: skip
+"""Columns that are printed, with the factor and the unit in which they are."""
 
 
 @command(stages=("reading", "writing"), outputs=("output", "figure"))
@@ -42,7 +47,7 @@ def quality(
     from walop_jax.io.plain_tables import table_format
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
-    from walop_jax.science.quality import OUTSIDE, append, quality_row, read_limits, table_of_nights
+    from walop_jax.science.quality import ERRORS, OUTSIDE, append, quality_row, read_limits, table_of_nights
 
     allowed = read_limits(limits)
     if output is not None:
@@ -70,12 +75,24 @@ def quality(
     hashes = {row["CALHASH"] for row in rows}
     mine = [row for row in table if str(row["CALHASH"]) in hashes]
     out = [f"night {row['NIGHT']:.0f}: {row[OUTSIDE]} outside the limits" for row in mine if row[OUTSIDE]]
+
+    def printed(row: Any, name: str) -> str:
+        factor, _ = SHOWN[name]
+        if name not in ERRORS:
+            return rounded(factor * float(row[name]))
+        return with_error(factor * float(row[name]), factor * float(row[ERRORS[name]]))
+
     shown = tuple(
-        (f"{row['NIGHT']:.0f}", *(f"{row[name]:.4g}" for name in SHOWN), str(row[OUTSIDE])) for row in mine
+        (f"{row['NIGHT']:.0f}", *(printed(row, name) for name in SHOWN), str(row[OUTSIDE])) for row in mine
+    )
+    head = (
+        "night",
+        *(f">{name} ({unit})" if unit else f">{name}" for name, (_, unit) in SHOWN.items()),
+        "outside",
     )
     title = f"{output or 'Quality numbers'}: {len(table)} night{'s' if len(table) != 1 else ''}"
     nights = [{name: row[name] for name in table.colnames} for row in mine]
     document = {"output": output, "nights": nights, "limits": {n: list(pair) for n, pair in allowed.items()}}
     document |= {"outside": out, "remarks": remarks}
-    display = Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown)
+    display = Display(title, head=head, rows=shown)
     return Outcome(table, document, display=display, warnings=(*remarks, *out), trusted=not out)

@@ -178,7 +178,7 @@ class InspectedSets(Displayed):
 def inspect_files(
     paths: Sequence[PathLike], tell: Callable[[str], None] = lambda text: None
 ) -> InspectedSets:
-    """Every file by itself; all as one set if none has a fault. Raises `DataError` if they cannot be one."""
+    """Every file by itself; all as one set if none has a fault. That they cannot be one is a fault as well."""
     sets: list[tuple[str, Inspection | DataError]] = []
     faults: list[str] = []
     for path in paths:
@@ -191,7 +191,12 @@ def inspect_files(
             continue
         faults += [f"{path}: {fault}" for fault in inspection.faults]
         sets.append((str(path), inspection))
-    joint = inspect(read_calibration_set(*paths)) if len(paths) > 1 and not faults else None
+    joint = None
+    if len(paths) > 1 and not faults:
+        try:
+            joint = inspect(read_calibration_set(*paths))
+        except DataError as error:
+            faults.append(f"these files cannot be fitted as one set: {error}")
     return InspectedSets(tuple(sets), joint, tuple(faults))
 
 

@@ -28,7 +28,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.score import Matrix, Vector
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.text import some, two_digits
+from walop_jax.io.text import per_cent, some, two_digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
@@ -272,16 +272,16 @@ def only_a_class(classes: Classes) -> Iterator[str]:
         names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], thresholds.SHOWN)
         yield (
             f"only a class of causes was named: {group.added} ({100 * group.members[0].probability:.0f} %) or {names}, "
-            f"with different effects on stars (p by {two_digits(100 * group.spread)} %, median, where the "
-            f"errors of the fit are {two_digits(100 * group.stated)} %; elements of the matrix by up to "
+            f"with different effects on stars (p by {per_cent(group.spread)} %, median, where the "
+            f"errors of the fit are {per_cent(group.stated)} %; elements of the matrix by up to "
             f"{two_digits(group.off)} errors): {_deciding(group)}"
         )
     shape = classes.shape
     if shape is not None and _dominates(shape.spread, shape.stated):
         yield (
             "the cause was described, not named: over the field, over the exposures and in its kind of polarisation it "
-            f"may differ from the description (p by {two_digits(100 * shape.spread)} %, median, where the errors of "
-            f"the fit are {two_digits(100 * shape.stated)} %)"
+            f"may differ from the description (p by {per_cent(shape.spread)} %, median, where the errors of "
+            f"the fit are {per_cent(shape.stated)} %)"
         )
 
 

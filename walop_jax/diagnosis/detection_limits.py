@@ -56,7 +56,7 @@ from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.progress import Stage
-from walop_jax.io.text import two_digits, two_digits_range
+from walop_jax.io.text import per_cent, per_cent_range, two_digits, two_digits_range
 from walop_jax.model.effects import EffectKind
 
 MANY_SHAPES = 8
@@ -237,8 +237,8 @@ class DetectionLimits(Displayed):
         worst = self.mistakes[0]
         return (
             "a systematic error too small to be detected could still bias q or u by "
-            f"{two_digits(100 * worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
-            f"{two_digits(100 * worst.error[1])} % at worst): "
+            f"{per_cent(worst.error[0])} % (median over the field, stars with p ≤ 5 %; "
+            f"{per_cent(worst.error[1])} % at worst): "
             f"{worst.in_words}"
         )
 
@@ -252,7 +252,7 @@ def _row(
     name: str, hidden: CouldHide | None, limit: DetectionLimit | ConditionLimit | None
 ) -> tuple[str, ...]:
     """A row of the table: a mistake as it could hide, or a limit of which no error is known."""
-    error = "" if hidden is None else two_digits_range(*(100.0 * value for value in hidden.error))
+    error = "" if hidden is None else per_cent_range(*hidden.error)
     if hidden is not None and not any(hidden.error):
         error = "none"
     if isinstance(limit, DetectionLimit):

@@ -19,7 +19,7 @@ from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import plain, probability, some, value_and_error
+from walop_jax.io.text import per_cent, plain, probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
@@ -455,7 +455,7 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         held = f"; mean squared residual of data left out ({step.get('heldout_scheme', '')}) {means}"
     yield f"{name}: χ² {step['chi2_before']:.1f} → {step['chi2_after']:.1f}{held}"
     if step.get("change_of_qu") is not None:
-        size = f"{100 * step['change_of_qu']:.2g} %"
+        size = f"{per_cent(step['change_of_qu'])} %"
         yield f"{name} changes calibrated q and u by up to {size}{', which is negligible' * bool(step['negligible'])}"
     places = [f"{key}: {value}" for key, value in step.get("where", {}).items() if value is not None]
     if places := "; by ".join(place for place in places if not place.endswith(" 100%")):

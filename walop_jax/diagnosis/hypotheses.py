@@ -18,11 +18,13 @@ from jaxtyping import Bool
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.score import Candidate, Score, Vector
+from walop_jax.io.text import rounded
 from walop_jax.likelihood.columns import Change, Columns, own_columns
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.parameters import leaves
 from walop_jax.model.ray import CONDITIONS
 
 FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what refers to their median
@@ -115,11 +117,38 @@ def probes(catalogue: Sequence[EffectKind], context: Context) -> Iterator[Probe]
         if effect.is_structural():
             continue
         groups = effect.probes(context)
-        for number, group in enumerate(groups):
-            name = effect.name if len(groups) == 1 else f"{effect.name}#{number}"
+        for name, group in zip(_names(effect, groups, context), groups, strict=True):
             probe = Probe(name, effect, group, context)
             if len(probe.widths):
                 yield probe
+
+
+def _names(effect: EffectKind, groups: Sequence[Sequence[Effect]], context: Context) -> list[str]:
+    """Names of the groups of probes of an effect: its own and, of several groups, what distinguishes one from another.
+
+    For example `blemish (camera E2, x −0.25 deg, y 0.05 deg)`, with the numbers of the first probe of a group.
+    """
+    if len(groups) == 1:
+        return [effect.name]
+    stated = [_shape_of(group[0], effect, context) for group in groups]
+    differing = [key for key in stated[0] if len({shape.get(key) for shape in stated}) > 1]
+    names = [f"{effect.name} ({', '.join(f'{key} {shape[key]}' for key in differing)})" for shape in stated]
+    twice = {name for name in names if names.count(name) > 1}
+    return [f"{name}, number {n}" if name in twice else name for n, name in enumerate(names)]
+
+
+def _shape_of(probe: Effect, effect: EffectKind, context: Context) -> dict[str, str]:
+    """Choices of a probe and the numbers of its shape, with their units, as texts by name."""
+    cameras = dict(enumerate(context.cameras))
+    texts = {
+        name: str(cameras.get(chosen, chosen) if name == "camera" else chosen)
+        for name, chosen in probe.choices().items()
+    }
+    units = {leaf.name: leaf.unit for leaf in leaves(probe)}
+    for name in effect.shape:
+        if np.ndim(value := getattr(probe, name)) == 0:
+            texts[name] = f"{rounded(float(value))} {units.get(name, '')}".strip()
+    return texts
 
 
 def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Probe]) -> list[Probe]:

@@ -26,6 +26,7 @@ from walop_jax.diagnosis.exact import Trial, in_words
 from walop_jax.diagnosis.examination import Evidence, explains, leaders
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Ranked
+from walop_jax.io.text import beside
 from walop_jax.model.effects import Described
 
 MOST_LISTED = 40
@@ -107,11 +108,13 @@ def refused(evidence: Evidence, trial: Trial) -> str:
     fitted, needed = trial.fit is not None, evidence.evidence_needed
     worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
     if worth <= needed:
-        return f"ln B = {worth:.3g} is not above {needed:.3g}"
+        found, limit = beside(worth, needed, ".{}g")
+        return f"ln B = {found} is not above {limit}"
     explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
     if explained < least:
         missing = evidence.chi2 - evidence.dof
-        return f"it explains {explained:.4g} of {missing:.4g} that are missing in χ², less than {least:.4g}"
+        found, limit = beside(explained, least, ".{}g")
+        return f"it explains {found} of {missing:.4g} that are missing in χ², less than {limit}"
     # The residuals are noise now: a pattern can only describe the same with more numbers.
     suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
     if not suffices and not evidence.stands(trial.effect, trial.evidence, fitted):

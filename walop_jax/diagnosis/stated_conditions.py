@@ -38,7 +38,7 @@ from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, pr
 from walop_jax.diagnosis.readings import with_places, with_values
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
-from walop_jax.io.text import with_error
+from walop_jax.io.text import beside, with_error
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.laws import YEAR
 from walop_jax.model.specification import effect_context
@@ -187,7 +187,8 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     causes = "; or for ".join(item.single.worded(item.score) for item in likely[: thresholds.SHOWN])
     further = f"; or for {len(likely) - thresholds.SHOWN} others" if len(likely) > thresholds.SHOWN else ""
     p = corrected_p(best.log_p, len(singles.testable))
-    yield f"the residuals ask for {causes}{further} (p = {p:.2g}, limit {thresholds.ALARM:g})"
+    found, limit = beside(p, thresholds.ALARM, ".{}g")
+    yield f"the residuals ask for {causes}{further} (p = {found}, limit {limit})"
 
 
 def _holds(score: Score, rival: Score) -> bool:

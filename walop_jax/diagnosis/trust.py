@@ -61,7 +61,7 @@ from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.errors import fail
 from walop_jax.io.names import IN_MEMORY
-from walop_jax.io.text import some
+from walop_jax.io.text import beside, some
 from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelExpansion
 from walop_jax.likelihood.layout import thinned
@@ -286,10 +286,11 @@ def sampled(result: FitResult, most: int = 0) -> FitResult:
 def _significant(finding: str, table: ScoreTable, cameras: Sequence[str] = ()) -> Iterator[str]:
     """A doubt if the lowest p-value of a table is below the threshold; `cameras` where its candidates are patterns."""
     if table.p_global < thresholds.ALARM:
-        found = table.significant(thresholds.ALARM, thresholds.SHOWN)
-        names = " | ".join(pattern_in_words(name, cameras) for name in found)
+        listed = table.significant(thresholds.ALARM, thresholds.SHOWN)
+        names = " | ".join(pattern_in_words(name, cameras) for name in listed)
+        found, limit = beside(table.p_global, thresholds.ALARM, ".{}g")
         yield (
-            f"the residuals {finding} (p = {table.p_global:.2g}, limit {thresholds.ALARM:g}; nearest: {names}): "
+            f"the residuals {finding} (p = {found}, limit {limit}; nearest: {names}): "
             "walop-jax diagnose looks for the cause"
         )
 

@@ -30,6 +30,7 @@ from walop_jax.fit.verdict import (
 )
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage
+from walop_jax.io.text import in_its_unit
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
@@ -344,7 +345,7 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         p, value = result.model[name], result.value(name)[0]
         assert p.prior is not None
         pull = (value - p.prior[0]) / p.prior[1]
-        text = f"{name} = {value:.6g} {p.unit} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
+        text = f"{name} = {in_its_unit(f'{value:.6g}', p.unit)} lies {pull:+.1f} prior widths from {p.prior[0]:g}"
         yield Doubt(Quality.AT_PRIOR_EDGE, text)
     yield from (Doubt(Quality.DOUBTED, sentence) for sentence in doubts)
     if result.errors_from != STATED:

@@ -53,6 +53,11 @@ def value_and_error(value: float | str | None, sigma: float | None) -> tuple[str
     return with_minus_sign(f"{round(value, places) + 0.0:.{shown}f}"), f"{round(sigma, places):.{shown}f}"
 
 
+def in_its_unit(number: str, unit: str) -> str:
+    """A number as text with its unit, and without a blank behind it where it has none."""
+    return f"{number} {unit}".rstrip()
+
+
 def date_of(mjd: float) -> str:
     """The calendar date (UTC) of a Modified Julian Date: 2026-06-29."""
     return (datetime.datetime(1858, 11, 17) + datetime.timedelta(days=float(mjd))).date().isoformat()
@@ -76,6 +81,49 @@ def rounded(value: float | None, form: str = ".4g") -> str:
 def two_digits(value: float | None) -> str:
     """A number to two digits, zeros included: 0.40, 2.0, 120."""
     return rounded(value, "#.2g")
+
+
+def beside(value: float, limit: float, form: str = "#.{}g") -> tuple[str, str]:
+    """A number and the limit that decides on it, as texts: to two digits, and to as many more as tell them apart.
+
+    `form` takes the number of digits. The limit keeps its two digits where these say it exactly.
+
+    >>> beside(0.0503, 0.05), beside(0.083, 0.05)
+    (('0.0503', '0.050'), ('0.083', '0.050'))
+    """
+
+    def both(digits: int) -> tuple[str, str]:
+        return rounded(value, form.format(digits)), rounded(limit, form.format(digits))
+
+    texts = first = both(2)
+    for digits in range(3, 10):
+        if value == limit or texts[0] != texts[1]:
+            break
+        texts = both(digits)
+    exact = math.isfinite(limit) and math.isclose(float(first[1].replace("−", "-")), limit, rel_tol=1e-12)
+    return texts[0], first[1] if exact and texts[0] != first[1] else texts[1]
+
+
+NOISE = 1e-8
+"""Share below which an effect on q, u or p is rounding noise of float64 optics, and no result."""
+
+
+def per_cent(share: float | None) -> str:
+    """A share in per cent to two digits, without the sign: 0.23; `< 10⁻⁶` for what is rounding noise."""
+    if share is not None and 0.0 < abs(share) < NOISE:
+        return f"< 10{str(round(math.log10(100.0 * NOISE))).translate(RAISED)}"
+    return two_digits(None if share is None else 100.0 * share)
+
+
+def per_cent_range(low: float, high: float) -> str:
+    """As `two_digits_range` of shares, in per cent."""
+    if not math.isfinite(low):
+        return ""
+    if low < NOISE:
+        return (
+            "0" if high == 0.0 else per_cent(high) if high < NOISE else f"{per_cent(low)} … {per_cent(high)}"
+        )
+    return two_digits_range(100.0 * low, 100.0 * high)
 
 
 def two_digits_range(low: float, high: float) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -268,7 +269,8 @@ def with_effects(
 
     A name or a class adds the effect at its neutral value, at the shape of its first probe; an instance starts at its
     values. Priors are centred on neutral, with the widths of the declarations. Raises ValueError for an unknown
-    name, for a duplicate effect, and for two effects on one number.
+    name, for a duplicate effect, for two effects on one number, and for the name of an effect that has nothing to
+    change by itself (`described` without descriptions).
 
     >>> walop.with_effects(walop.base_model(calset), ["hwp1_axis"], calset).effect_names
     ('hwp1_axis',)
@@ -280,6 +282,12 @@ def with_effects(
         if not isinstance(effect, Effect):
             kind = effect_by_name(effect, model.catalogue) if isinstance(effect, str) else effect
             effect = next((group[0] for group in kind.probes(context)), kind.neutral(context))
+            if not leaves(effect) and eqx.tree_equal(effect.patch(model.template), model.template):
+                raise ValueError(
+                    f"effect {effect.name!r} changes nothing unless it is said what it changes: give its choices, in a "
+                    f"model file in [effects.{effect.name}] (sentences = [...] for descriptions), in Python an effect "
+                    f"of walop.effect_by_name({effect.name!r})"
+                )
         if effect.name in (present.name for present in active):
             raise ValueError(f"effect {effect.name!r} is in the model already")
         active.append(effect)

@@ -35,7 +35,7 @@ from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
-from walop_jax.io.text import two_digits, value_and_error
+from walop_jax.io.text import per_cent, value_and_error
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.laws import Law
 from walop_jax.model.specification import effect_context, with_effects
@@ -390,7 +390,7 @@ class Survey(Drawn):
             "valid": f"from MJD {start:.2f} until {stop:.2f}",
         }
         if self._matrix is not None:
-            error = two_digits(100.0 * self.error_of_p(self.last))
+            error = per_cent(self.error_of_p(self.last))
             facts["p of a star"] = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
         if not self.breaks:
             facts["changes"] = "none found beyond the laws"

@@ -28,6 +28,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.inspection import about_exposures
 from walop_jax.data.records import Exposures
 from walop_jax.data.user_tables import InputTable
+from walop_jax.io.text import in_its_unit
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
@@ -149,7 +150,7 @@ def plan_from(
             cheapest, least = optimal.least_budget(problem, criterion.variance(goal), gap=gap)
             needed = (_cost(problem, cheapest.weights) / 60.0, least / 60.0)
         except NotEstimableError:
-            reason = f"no time reaches {digits(goal, '.3g')} {criterion.unit}"
+            reason = f"no time reaches {in_its_unit(digits(goal, '.3g'), criterion.unit)}"
             endless = (f"{criterion.what}: {reason}; add other settings to the candidates",)
     total = experiment.known + information_of_weights(experiment, best.weights)[0]
     plan = _observed(chosen, lines, minutes)

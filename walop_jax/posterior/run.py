@@ -24,7 +24,7 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT
 from walop_jax.io.run_folder import RunFolder
-from walop_jax.io.text import two_digits
+from walop_jax.io.text import per_cent
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
@@ -179,7 +179,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         accuracy = documents.get("summary", {}).get("accuracy_of_p")
         if accuracy and documents["summary"].get("trusted"):
             share = f"below 0.1 % over {100 * accuracy['share_below_goal']:.0f} % of it"
-            median = f"{two_digits(100 * accuracy['median'])} % (median of the field)"
+            median = f"{per_cent(accuracy['median'])} % (median of the field)"
             facts.append(("p of a star", f"{median}, {share}"))
         others = {n: d["shown"]["title"] for n, d in documents.items() if "shown" in d and n != "summary"}
         facts += others.items()

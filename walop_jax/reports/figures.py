@@ -26,6 +26,7 @@ from walop_jax.science.field_accuracy import FieldAccuracy
 
 Parameters = Float[np.ndarray, " n"]  # full vectors
 FITTED = Normalize(0.7, 1.3)  # scale of rms residuals of a fit that explains its data, the same for every run
+RELEVANT = 1e-4  # of the largest change of a matrix: the scale of no map is smaller
 
 
 @styled
@@ -175,16 +176,17 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """Change of the matrix over the field (%), a scale for each name of Paper II; ValueError for other places."""
+    """Change of the matrix over the field (%), a scale for each element; ValueError for maps of other places.
+
+    A scale that two elements share would show nothing of the smaller one.
+    """
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
     change = 100.0 * (new.values - old.values)
-    kinds = [style.element_kind(i, new.arms) for i in range(len(change))]
+    least = RELEVANT * style.largest_size(change)
     figure, axes = on.panels(8.6, 2.3 * new.arms, new.arms, 3, maps=True)
-    for axis, values, name, kind in zip(
-        axes.ravel(), change, style.element_symbols(new.arms), kinds, strict=True
-    ):
-        far = style.rounded_up(style.largest_size(change[np.equal(kinds, kind)]))
+    for axis, values, name in zip(axes.ravel(), change, style.element_symbols(new.arms), strict=True):
+        far = style.rounded_up(max(style.largest_size(values), least))
         title, norm = f"change of {name}", Normalize(-far, far)
         image = style.pixel_map(axis, title, values, field_of(new), norm, style.DIVERGING)
         style.colour_bar(image, "new − old (%)" if axis in axes[:, -1] else "")

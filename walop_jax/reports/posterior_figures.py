@@ -30,6 +30,11 @@ def label(name: str, unit: str = "") -> str:
     return f"{text} ({unit_in_words(unit)})" if unit else text
 
 
+def key(names: Sequence[str]) -> str:
+    """What the symbols of coefficients mean, a line each: their names in the table of parameters."""
+    return "\n".join(f"{symbol}: {name}" for name in names if (symbol := label(name)) != name)
+
+
 def unit_in_words(unit: str) -> str:
     """A unit as it is printed: µm, deg⁻²."""
     raised = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(RAISED), unit)
@@ -105,6 +110,8 @@ def corner_figure(
     )  # fmt: skip
     edges = {"left": 0.71 / width, "bottom": 0.64 / width, "top": 1.0 - 0.43 / width}
     figure.subplots_adjust(**edges, right=1.0 - 0.07 / width, wspace=0.05, hspace=0.05)
+    place = {"ha": "right", "va": "top", "fontsize": 7 if few else 4.5, "linespacing": 1.4}
+    figure.text(1.0 - 0.07 / width, 1.0 - 0.05 / width, key(names), **place)
     low, middle, high = np.quantile(draws, (0.1587, 0.5, 0.8413), axis=0)
     panels = np.array(figure.axes, dtype=object).reshape(k, k)
     for i in range(k):
@@ -155,6 +162,7 @@ def trace_figure(
             caption = f"autocorrelation time (bar) {tau[i]:.1f} steps"
             axes.text(1.0, 1.0, caption, transform=axes.transAxes, fontsize=SMALL, ha="right", va="bottom")
         axes.set_ylabel(label(names[i], units[i]), fontsize=SMALL, rotation=0, ha="right", va="center")
+        axes.text(0.0, 1.0, key((names[i],)), transform=axes.transAxes, fontsize=SMALL, va="bottom")
         axes.tick_params(labelsize=SMALL - 1)
         axes.yaxis.set_major_locator(MaxNLocator(3))
         axes.yaxis.set_major_formatter(ScalarFormatter(useOffset=False))

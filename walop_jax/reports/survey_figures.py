@@ -104,6 +104,7 @@ PANELS: Mapping[str, tuple[tuple[str, ...], float, str]] = {
     "ACCURACY": (("ACCURACY",), 100.0, "error of p (%)"),
 }
 """Panels of the quality numbers: columns, factor, label."""
+ASIDE = 0.012  # of the time shown: distance of the numbers of one night in a panel
 
 
 @styled
@@ -113,14 +114,18 @@ def quality_figure(table: Any, limits: Limits) -> Figure:
     panels = {**PANELS, GAIN: (tuple(gains), 1.0, "gain of cameras")}
     figure, axes = PAGE.panels(6.4, 0.9 + 1.1 * len(panels), len(panels), 1, sharex=True)
     time = day_of(table["NIGHT"])
+    known = time[np.isfinite(time)]
+    aside = ASIDE * max(float(np.ptp(known)) if known.size else 0.0, 1.0)
     for axis, (limited, (names, factor, label)) in zip(axes[:, 0], panels.items(), strict=True):
-        for name, marker in zip(names, itertools.cycle("osD^v<>phx"), strict=False):
+        for number, (name, marker) in enumerate(zip(names, itertools.cycle("osD^v<>phx"), strict=False)):
+            # Side by side: bars in one place would hide each other.
+            at = time + aside * (number - 0.5 * (len(names) - 1))
             values = factor * np.ma.filled(np.ma.asarray(table[name], float), np.nan)
             error = factor * np.asarray(table[ERRORS[name]], float) if name in ERRORS else None
             outside = np.array([name in str(entry).split() for entry in table[OUTSIDE]])
             camera = name.removeprefix(f"{GAIN}_")
-            axis.errorbar(time, values, error, fmt=marker, ms=3, lw=0.8, color=AFTER, label=camera)
-            axis.plot(time[outside], values[outside], marker, ms=5, color=BEFORE, zorder=5)
+            axis.errorbar(at, values, error, fmt=marker, ms=3, lw=0.8, color=AFTER, label=camera)
+            axis.plot(at[outside], values[outside], marker, ms=5, color=BEFORE, zorder=5)
         if limited in limits and limited != GAIN:
             low, high = (factor * value for value in limits[limited])
             axis.axhspan(low, high, color=QUIET, lw=0, zorder=0)

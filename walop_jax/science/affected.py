@@ -19,7 +19,7 @@ from jaxtyping import Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.text import some, two_digits
+from walop_jax.io.text import beside, some, two_digits
 from walop_jax.science.apply import Stars, results_of
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.sky.nights import night_of
@@ -86,12 +86,19 @@ class Affected(Displayed):
         rows = []
         for night in self.nights:
             evening = f"{night.night:.0f}" if np.isfinite(night.night) else ""
-            shifts = map(two_digits, (night.median, night.most, night.largest))
+            most, _ = beside(night.most, self.limit)
+            shifts = two_digits(night.median), most, two_digits(night.largest)
             means = (f"{100 * mean:+.4f} %" for mean in (night.q, night.u))
             rows.append((night.catalogue, evening, f"{night.stars}", *shifts, *means, self._reason(night)))
         head = ("catalogue", ">night", ">stars", ">median", ">95 %", ">largest", ">q", ">u", "")
-        again = some(list(self.again), 10) if self.again else "nothing"
-        facts = (("to be made again", again), ("limit", f"{self.limit:g} standard errors, 95 % of the stars"))
+        limit, allowed = (
+            f"{self.limit:g} standard errors",
+            f"{100 * (1 - MOST):.0f} % of the stars of a night",
+        )
+        again = f"nothing: nowhere do more than {allowed} shift by more than {limit}"
+        if self.again:
+            again = some(list(self.again), 10)
+        facts = (("to be made again", again), ("limit", f"{limit}; {allowed} may shift by more"))
         return Display("Shift of q, u by the new calibration, in standard errors", facts, head, tuple(rows))
 
 

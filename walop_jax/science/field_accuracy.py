@@ -30,7 +30,7 @@ from walop_jax.calibration.accuracy import (
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
 from walop_jax.fit.refit import FitResult
-from walop_jax.io.text import two_digits
+from walop_jax.io.text import beside, per_cent, two_digits
 from walop_jax.likelihood.inverses import whitening
 
 COARSE = 8  # the same where the question is what limits it
@@ -97,7 +97,8 @@ class FieldAccuracy:
         what = f"effects of {two_digits(100 * allowed)} % on stars are measured"
         asked = []
         for name, gap in unmeasured(self.not_measured).items():
-            found = f"{name} not measured, {off_by(*gap.error)} at the usual size"
+            size, _ = beside(100 * gap.error[0], 100 * allowed)
+            found = f"{name} not measured, {off_by(*gap.error, shown=size)} at the usual size"
             asked.append(Requirement(what, gap.error[0] <= allowed, found, gap.remedy))
         light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
         advice = f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} gives the time that it takes"
@@ -109,7 +110,8 @@ class FieldAccuracy:
         asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
-            found = f"a systematic error of {two_digits(100 * self.hidden)} % of q or u would go undetected"
+            size, _ = beside(100 * self.hidden, 100 * self.goal)
+            found = f"a systematic error of {size} % of q or u would go undetected"
             advice = self.remedy or "walop-jax limits lists the exposures that would show it"
             asked.append(Requirement(what, self.hidden <= self.goal, found, advice, needed=False))
         return tuple(asked)
@@ -150,12 +152,12 @@ class FieldAccuracy:
         if not all(mistake.ahead for mistake in self.not_measured):
             apart = " apart from quantities not measured"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
-        median_error = f"{two_digits(100 * self.median)} %{apart} (median error for p ≤ 5 %)"
+        median_error = f"{per_cent(self.median)} %{apart} (median error for p ≤ 5 %)"
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:
             verdict = [f"no: {lacks[0].found}", *(lack.found for lack in lacks[1:])] if lacks else []
-            verdict = verdict or [f"yes: {two_digits(100 * self.reached)} % in {self.judged}"]
+            verdict = verdict or [f"yes: {per_cent(self.reached)} % in {self.judged}"]
             lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
             lines += [("what to do", lack.advice) for lack in lacks[:1] if lack.advice != self.remedy]
         if self.limited_by:
@@ -182,10 +184,10 @@ class Requirement:
 
 
 def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: bool = True) -> Requirement:
-    limit = f"{two_digits(100 * allowed)} %"
-    found = f"{two_digits(100 * error)} % in {where}, {limit} allowed"
+    size, limit = beside(100 * error, 100 * allowed)
+    found = f"{size} % in {where}, {limit} % allowed"
     # An error that is NaN is not known.
-    return Requirement(f"p known to {limit} in {where}", error <= allowed, found, advice, needed)
+    return Requirement(f"p known to {limit} % in {where}", error <= allowed, found, advice, needed)
 
 
 def known_in_half(error: float, goal: float = GOAL, cause: str = "") -> Requirement:

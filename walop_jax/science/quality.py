@@ -229,7 +229,9 @@ def joined(old: Any, new: Any) -> tuple[Any, list[str]]:
             remarks.append(f"{row['RUN']}: this calibration is in the table already")
             continue
         if key in latest:
-            remarks.append(f"{row['RUN']}: takes the place of {rows[latest[key]]['RUN']} in night {key[1]}")
+            remarks.append(
+                f"{row['RUN']}: takes the place of {rows[latest[key]]['RUN']} in night {float(key[1]):.0f}"
+            )
         hashes.add(content)
         latest[key] = number
     table = rows[sorted(latest.values())]

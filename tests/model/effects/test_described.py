@@ -28,6 +28,7 @@ from walop_jax.model.parameters import NAME
 from walop_jax.model.planning import exposure_arrays
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import Sight
+from walop_jax.model.specification import make_model, with_effects
 
 
 def said(*sentences, values):
@@ -398,3 +399,14 @@ def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sk
     zero = jnp.asarray(0.0)
     np.testing.assert_array_equal(light.telescope(there, zero, zero), light.telescope(bare, zero, zero))
     assert left_behind(there) == ("described",)
+
+
+@pytest.mark.parametrize("name", ["described", "deviations", "other_description"])
+def test_an_effect_that_would_change_nothing_is_refused(name):
+    """By its name alone it has nothing to change: it would be listed, and nothing be fitted."""
+    message = rf"effect '{name}' changes nothing unless it is said what it changes: .*\[effects\.{name}\]"
+    for given in (name, effect_by_name(name)):
+        with pytest.raises(ValueError, match=message):
+            with_effects(make_model("SOUTH", nominal_instrument()), [given], scenes.CONTEXT)
+    with pytest.raises(ValueError, match=message):
+        model_without_data("WALOP-SOUTH", f'[model]\neffects = ["{name}"]\n')
