@@ -53,10 +53,13 @@ def test_false_alarms_are_those_of_the_study():
 
 def test_the_test_command_is_that_of_contributors_and_of_the_checks():
     """Set-up and tests are two lines that anybody can paste."""
-    install, test = "pip install -e '.[test]'", "python -m pytest -n 2 --fast"
-    assert f"{install} && {test}\n" in TEXT
+    upgrade, install = "python -m pip install --upgrade pip", "pip install -e . --group test"
+    test = "python -m pytest -n 2 --fast"
+    assert f"{upgrade} && {install} && {test}\n" in TEXT
     contributing = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
     checks = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     for text in (contributing, checks):
         assert test in text
-    assert install in contributing
+    assert f"{upgrade} && {install}\n" in contributing
+    # Pip that comes with Python 3.11 to 3.13 knows no dependency groups: it is upgraded first here as well.
+    assert checks.index("pip install --quiet --upgrade pip") < checks.index("-e . --group test")
