@@ -164,12 +164,12 @@ def test_every_library_is_declared():
 
 def test_every_library_is_locked_with_its_hashes():
     """A version and the hashes of its files for every dependency, within the bounds of pyproject.toml."""
-    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    declared = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())
     text = (PACKAGE.parent / ".ci" / "requirements.lock").read_text()
     locked = dict(
         re.findall(r"^([\w.-]+)==([\w.]+)[^\n]*\\\n    --hash=sha256:[0-9a-f]{64}", text, re.MULTILINE)
     )
-    for entry in (*project["dependencies"], *project["optional-dependencies"]["test"]):
+    for entry in (*declared["project"]["dependencies"], *declared["dependency-groups"]["test"]):
         name, least = re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", entry).groups()  # type: ignore[union-attr]
         version = locked[name.lower()]
         assert [int(n) for n in version.split(".")[:2]] >= [int(n) for n in least.split(".")[:2]], entry

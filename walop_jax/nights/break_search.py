@@ -8,10 +8,10 @@ size come from `changes`, with everything else fitted anew: the course of a rand
 
 over any forest of pairs (Hunter 1976; Worsley 1982, Biometrika 69, 297). Steps of one parameter at neighbouring
 boundaries are pairs, and each bad night with a step beside it: a step less the next one is the night between, and
-the informations give the correlations, ρ = (I_b + I_(b+1) − I_night)/2√(I_b I_(b+1)). z is normal, as the equations are
-linear. Then the break becomes a law, and the search goes on. Its date is that of the largest z² of its parameter; dates
-within `DATES` of that may be it as well. Others whose z² stays within `RIVAL` look alike; the break becomes a law of
-the best of them that stars can be corrected for.
+their information I gives the correlations, ρ = (I_b + I_(b+1) − I_night)/2√(I_b I_(b+1)). z is normal, as the
+equations are linear. Then the break becomes a law, and the search goes on. Its date is that of the largest z² of its
+parameter; dates within `DATES` of that may be it as well. Others whose z² stays within `RIVAL` look alike; the break
+becomes a law of the best of them that stars can be corrected for.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def _information(
 
 
 def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2 c n"]]:
-    """Scores and informations of changes of every parameter (n): from every cell (c) on, then in every cell alone.
+    """Scores and information of changes of every parameter (n): from every cell (c) on, then in every cell alone.
 
     From the first cell on is a value in all nights. The information is 0 where the laws take the change up. Scaled as
     the equations.
