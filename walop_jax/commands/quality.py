@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.io.atomic import check_output
 from walop_jax.io.display import Display
 from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.text import with_error, with_minus_sign
 
 SHOWN = ("CHI2DOF", "ANGLE", "P_RATIO", "ZERO_Q", "ZERO_U", "ACCURACY")
 
@@ -42,7 +44,7 @@ def quality(
     from walop_jax.io.plain_tables import table_format
     from walop_jax.reports.posterior_figures import save_figure
     from walop_jax.reports.survey_figures import quality_figure
-    from walop_jax.science.quality import OUTSIDE, append, quality_row, read_limits, table_of_nights
+    from walop_jax.science.quality import OUTSIDE, append, columns, quality_row, read_limits, table_of_nights
 
     allowed = read_limits(limits)
     if output is not None:
@@ -71,11 +73,20 @@ def quality(
     mine = [row for row in table if str(row["CALHASH"]) in hashes]
     out = [f"night {row['NIGHT']:.0f}: {row[OUTSIDE]} outside the limits" for row in mine if row[OUTSIDE]]
     shown = tuple(
-        (f"{row['NIGHT']:.0f}", *(f"{row[name]:.4g}" for name in SHOWN), str(row[OUTSIDE])) for row in mine
+        (f"{row['NIGHT']:.0f}", *(_number(row, name) for name in SHOWN), str(row[OUTSIDE])) for row in mine
     )
+    head = (f">{name} / {unit}" if (unit := columns()[name][0]) else f">{name}" for name in SHOWN)
     title = f"{output or 'Quality numbers'}: {len(table)} night{'s' if len(table) != 1 else ''}"
     nights = [{name: row[name] for name in table.colnames} for row in mine]
     document = {"output": output, "nights": nights, "limits": {n: list(pair) for n, pair in allowed.items()}}
     document |= {"outside": out, "remarks": remarks}
-    display = Display(title, head=("night", *(f">{name}" for name in SHOWN), "outside"), rows=shown)
+    display = Display(title, head=("night (MJD)", *head, "outside"), rows=shown)
     return Outcome(table, document, display=display, warnings=(*remarks, *out), trusted=not out)
+
+
+def _number(row: Any, name: str) -> str:
+    """A number of a night with its standard error, where it has one."""
+    from walop_jax.science.quality import ERRORS
+
+    value, error = float(row[name]), float(row[ERRORS[name]]) if name in ERRORS else 0.0
+    return with_error(value, error) if error > 0 and math.isfinite(value) else with_minus_sign(f"{value:.4g}")
