@@ -9,7 +9,7 @@ import pytest
 from star_tables import stars
 
 from walop_jax.data.settings import Settings
-from walop_jax.science.catalogue_readings import Readings, Rows, readings_of, turned
+from walop_jax.science.catalogue_readings import CatalogueReadings, Rows, readings_of, turned
 
 ROTATOR = 35.0
 
@@ -25,7 +25,7 @@ def sound(vectors) -> Rows:
 
 def first(vectors, rows, **options) -> str:
     found = readings_of(vectors, rows, **options)
-    assert isinstance(found, Readings)
+    assert isinstance(found, CatalogueReadings)
     return found.words() if found.better else ""
 
 

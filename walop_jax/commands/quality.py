@@ -86,7 +86,7 @@ def quality(
         (f"{row['NIGHT']:.0f}", *(printed(row, name) for name in SHOWN), str(row[OUTSIDE])) for row in mine
     )
     head = (
-        "night",
+        "night (MJD)",
         *(f">{name} ({unit})" if unit else f">{name}" for name, (_, unit) in SHOWN.items()),
         "outside",
     )

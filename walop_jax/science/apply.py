@@ -26,7 +26,7 @@ from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
-from walop_jax.science.catalogue_readings import Readings, readings_of, sample_of
+from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of, sample_of
 from walop_jax.science.catalogue_readings import Rows as ReadRows
 from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
@@ -357,7 +357,7 @@ class _Application:
         )
         return [residuals]
 
-    def readings(self, chosen: Chosen, *, doubted: bool = False) -> Readings | None:
+    def readings(self, chosen: Chosen, *, doubted: bool = False) -> CatalogueReadings | None:
         """Other readings of the rows of some bright ones of the chosen stars; `None` where nothing can be said."""
         catalogue = self.catalogue
         points, r = catalogue.points, np.flatnonzero(chosen[catalogue.star] & ~catalogue.copy)

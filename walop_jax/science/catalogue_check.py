@@ -28,7 +28,7 @@ from scipy import special
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import star_residuals as residuals
-from walop_jax.science.catalogue_readings import DISAGREE, Readings
+from walop_jax.science.catalogue_readings import DISAGREE, CatalogueReadings
 from walop_jax.science.instrument_changes import InstrumentChange, PossibleChange, profile
 from walop_jax.science.left_over_sky import LeftOverSky
 from walop_jax.science.own_light import ArmChange, OwnLightCheck
@@ -41,6 +41,7 @@ _MOST_CHANGES = 6
 _ROUNDS = 8
 _SETTLED = 0.05  # standard errors
 _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
+_FAR_TOO_SMALL = 5.0  # factor on N_ERR that is likelier a fault of the counts
 _REFERENCE = 1e6  # electron
 
 Matrix = Float[np.ndarray, "c c"]
@@ -97,7 +98,7 @@ class CatalogueCheck:
     growth: Growth = IN_UNITS
     places: tuple[DisagreeingPlace, ...] = ()
     sky: LeftOverSky | None = None
-    readings: Readings | None = None
+    readings: CatalogueReadings | None = None
     own: OwnLightCheck | None = None
 
     @property
@@ -181,7 +182,8 @@ class CatalogueCheck:
         if self.noise_is_off:
             factor = np.sqrt(self.noise)
             word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
-            text = f"N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were"
+            instead = "" if factor < _FAR_TOO_SMALL else "the counts contradict the calibration, or "
+            text = f"{instead}N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were"
             texts.append(f"{text} multiplied by {factor:.3g}")
         return tuple(texts)
 

@@ -101,7 +101,7 @@ NO_FIT = Fit(np.inf, 1.0, np.inf)
 
 
 @dataclasses.dataclass(frozen=True)
-class Reading:
+class CatalogueReading:
     """Another reading of a catalogue: what must have happened, what to do about it, how well the stars agree then.
 
     `usual` are changes as instruments have them: no mistake of the catalogue.
@@ -124,12 +124,12 @@ class Reading:
 
 
 @dataclasses.dataclass(frozen=True)
-class Readings:
+class CatalogueReadings:
     """How a catalogue of so many `stars` (a sample) agrees as it stands, and the readings that mend it, best first."""
 
     stars: int
     stands: Fit
-    better: tuple[Reading, ...] = ()
+    better: tuple[CatalogueReading, ...] = ()
 
     def words(self) -> str:
         """What is wrong, in a sentence."""
@@ -152,7 +152,7 @@ class Readings:
         return {**about, "readings": [reading.document() for reading in self.better]}
 
 
-def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) -> Readings | None:
+def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) -> CatalogueReadings | None:
     """The readings of a sample of a catalogue that mend it; None of few stars, or without a camera to spare.
 
     `rows` are at any place of the field, those of `counts` that are not used NaN. All readings are tried where the
@@ -167,7 +167,7 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
         return None
     cameras = vectors.instrument.cameras
     arms = [arm for arm in cameras.arms if len(arm) > 1]
-    tries: list[Iterable[Reading]] = [[*orders(cameras.names, arms), *_units(rows)]]
+    tries: list[Iterable[CatalogueReading]] = [[*orders(cameras.names, arms), *_units(rows)]]
     if doubted or stands.disagree > DISAGREE:
         named = [*orders(cameras.names), *_units(rows), *_fields(), *_rotators(rows)]
         tries = [named, _turns(judge, rows), _shifts(judge, rows), _filters(vectors, rows)]
@@ -181,8 +181,8 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
             break
         if good:
             alike = tuple(item for item in good if item.fit.loss < good[0].fit.loss + ALIKE)
-            return Readings(count, stands, alike)
-    return Readings(count, stands)
+            return CatalogueReadings(count, stands, alike)
+    return CatalogueReadings(count, stands)
 
 
 def _mends(fit: Fit, stands: Fit) -> bool:
@@ -198,7 +198,7 @@ class Judge:
     def __init__(self, vectors: AnalysisVectors) -> None:
         self.vectors = vectors
 
-    def judged(self, reading: Reading, rows: Rows) -> Reading:
+    def judged(self, reading: CatalogueReading, rows: Rows) -> CatalogueReading:
         """A reading with how well it fits; not at all where it cannot be made."""
         try:
             return dataclasses.replace(reading, fit=self.fit(reading.change(rows)))
@@ -276,7 +276,7 @@ def sample_of(rows: Rows) -> Rows:
 # ----------------------------------------------------------------------------------------------- the readings
 
 
-def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) -> Iterator[Reading]:
+def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) -> Iterator[CatalogueReading]:
     """Other orders of the cameras: all, or with `arms` those that leave each arm its cameras."""
     count = len(names)
     if arms is not None:
@@ -296,14 +296,14 @@ def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) ->
         tried = [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
     for order in tried:
         held = ", ".join(names[int(k)] for k in np.argsort(order))
-        yield Reading(
+        yield CatalogueReading(
             f"the columns of N and N_ERR were in the order {held}",
             f"their order is {', '.join(names)}: exchange the files or columns",
             lambda r, at=list(order): r.changed(counts=r.counts[:, at], sigma=r.sigma[:, at]),
         )
 
 
-def _units(rows: Rows) -> Iterator[Reading]:
+def _units(rows: Rows) -> Iterator[CatalogueReading]:
     """Magnitudes in the place of intensities."""
     if rows.counts.size and np.nanmax(np.abs(rows.counts)) < _MAGNITUDES:
 
@@ -311,7 +311,7 @@ def _units(rows: Rows) -> Iterator[Reading]:
             counts = 10.0 ** (-0.4 * (r.counts - np.nanmedian(r.counts)))
             return r.changed(counts=counts, sigma=0.4 * np.log(10.0) * counts * r.sigma)
 
-        yield Reading(
+        yield CatalogueReading(
             "N were magnitudes", "give intensities in electrons: they add up, magnitudes do not", intensities
         )
 
@@ -333,9 +333,9 @@ MIRRORED: tuple[tuple[str, str, Turn], ...] = (
 """Mistakes by which the field is a mirror image of itself."""
 
 
-def _fields() -> Iterator[Reading]:
+def _fields() -> Iterator[CatalogueReading]:
     for what, remedy, turn in MIRRORED:
-        yield Reading(what, remedy, _placed(turn))
+        yield CatalogueReading(what, remedy, _placed(turn))
 
 
 def turned(x: OfRows, y: OfRows, angle: float | OfRows) -> tuple[OfRows, OfRows]:
@@ -344,7 +344,7 @@ def turned(x: OfRows, y: OfRows, angle: float | OfRows) -> tuple[OfRows, OfRows]
     return c * x + s * y, c * y - s * x
 
 
-def _rotators(rows: Rows) -> Iterator[Reading]:
+def _rotators(rows: Rows) -> Iterator[CatalogueReading]:
     """ROTATOR of another sign, zero or unit, where X and Y were made with it, and where they were not."""
     known = np.isfinite(rows.rotator)
     if not known.all():
@@ -371,12 +371,14 @@ def _rotators(rows: Rows) -> Iterator[Reading]:
 
         number = with_minus_sign(f"{change(np.array([typical]))[0]:.4g}")
         size = f", {number}° in place of {with_minus_sign(f'{typical:.4g}')}°"
-        yield Reading(what + size, remedy + made, both)
+        yield CatalogueReading(what + size, remedy + made, both)
         if several:
-            yield Reading(what, remedy, lambda r, change=change: r.changed(rotator=change(r.rotator)))
+            yield CatalogueReading(
+                what, remedy, lambda r, change=change: r.changed(rotator=change(r.rotator))
+            )
 
 
-def _turns(judge: Judge, rows: Rows) -> Iterator[Reading]:
+def _turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     """The field turned by any angle, which is searched."""
     few = _some_of(rows)
 
@@ -389,14 +391,14 @@ def _turns(judge: Judge, rows: Rows) -> Iterator[Reading]:
     best: Any = optimize.minimize_scalar(loss, bounds=(start - _STEP, start + _STEP), method="bounded")
     angle = (float(best.x) + 180.0) % 360.0 - 180.0
     number = with_minus_sign(f"{angle:+.2f}")
-    yield Reading(
+    yield CatalogueReading(
         f"X and Y were turned by {number}°, as a ROTATOR that is {number}° larger turns them",
         "correct the rotator of the pointing",
         _placed(lambda x, y: turned(x, y, angle)),
     )
 
 
-def _shifts(judge: Judge, rows: Rows) -> Iterator[Reading]:
+def _shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     """The field shifted, by what is searched."""
     few, reach = _some_of(rows), _RANGE * judge.vectors.half_width
 
@@ -425,7 +427,7 @@ def _shifts(judge: Judge, rows: Rows) -> Iterator[Reading]:
             f"{abs(north):.4f}° {'south' if north > 0 else 'north'}",
         )
         where = f": the field centre lies {' and '.join(sides)} of the one that was taken"
-    yield Reading(
+    yield CatalogueReading(
         f"all stars lay at X {x}° and Y {y}° from where they are said to be{where}",
         "correct RA and DEC of the pointing, or the zero of X and Y",
         moved(best),
@@ -438,7 +440,7 @@ def _some_of(rows: Rows) -> Rows:
     return rows.of(rows.star % every == 0)
 
 
-def _filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[Reading]:
+def _filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[CatalogueReading]:
     """Other filters, where all rows are of one."""
     stated = np.unique(rows.settings.filter)
     if len(stated) > 1:
@@ -452,10 +454,12 @@ def _filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[Reading]:
                 other = dataclasses.replace(r.settings, filter=np.full(len(r.x), name))
                 return r.changed(settings=other)
 
-            yield Reading(f"they were seen in {name}", f"correct FILTER, which says {stated[0]}", change)
+            yield CatalogueReading(
+                f"they were seen in {name}", f"correct FILTER, which says {stated[0]}", change
+            )
 
 
-def _gains(judge: Judge, rows: Rows) -> Iterator[Reading]:
+def _gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     """Another gain of one camera, or of one arm, by which unpolarised stars have the shares of the calibration."""
     cameras = judge.vectors.instrument.cameras
     names, count = cameras.names, len(cameras)
@@ -468,7 +472,7 @@ def _gains(judge: Judge, rows: Rows) -> Iterator[Reading]:
             factor = float(np.nanmedian(other / own))
             if np.isfinite(factor) and factor > 0:
                 which = " and ".join(names[n] for n in members)
-                yield Reading(
+                yield CatalogueReading(
                     f"N of {which} were {factor:.4g} times as large",
                     "is that of one gain, unit, aperture and exposure with the other cameras?",
                     _scaled(np.where(np.isin(np.arange(count), k), factor, 1.0)),
@@ -476,7 +480,7 @@ def _gains(judge: Judge, rows: Rows) -> Iterator[Reading]:
                 )
 
 
-def _all_gains(judge: Judge, rows: Rows) -> Iterator[Reading]:
+def _all_gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     """Other gains of all cameras: those of another instrument, say."""
     names = judge.vectors.instrument.cameras.names
     counts, expected = judge.unpolarised(rows)
@@ -486,7 +490,7 @@ def _all_gains(judge: Judge, rows: Rows) -> Iterator[Reading]:
     if np.isfinite(factors).all() and (factors > 0).all():
         others = " or ".join(name for name in shipped() if name != judge.vectors.instrument.name)
         listed = ", ".join(f"{factor:.4g}" for factor in factors)
-        yield Reading(
+        yield CatalogueReading(
             f"N of {', '.join(names)} were {listed} times as large",
             f"are they of the calibrated instrument, and not of {others} or another one; are all cameras in one unit?",
             _scaled(factors),

@@ -12,7 +12,7 @@ Symbols     c  the question: shift of (q, u) of an unpolarised star by a unit ch
                (`Estimate.gain`), of the balance of an arm: first camera brighter by half of it, second fainter by half
             B  interstellar polarisation of the field: means of q and u of each exposure group, polynomials of X and Y
             A  errors of the calibration and of unknown colours, θ ~ N(0, 1); finer interstellar structure, cosines of
-               variance a k⁻ᵝ with k half waves over the field, a of the largest marginal likelihood
+               variance a k⁻ᵝ with k half waves over the field, a as large as the marginal likelihood allows
             own  scatter of the stars' own polarisation, of variance τ² in q and in u, such that χ² is its degrees of
                freedom (Paule & Mandel 1982, J. Res. NBS 87, 377)
 Size        γ = c̃ᵀ W y / c̃ᵀ W c, W the inverse of noise + τ², c̃ what B and A leave of c
@@ -51,6 +51,7 @@ _STARS_OF_DEGREE = (0, 30, 100)
 """Stars from which interstellar polarisation is a constant, a polynomial of degree 1, 2 in X and Y, …"""
 _STARS_OF_WAVE = 4  # … stars for each of the cosines of the finer structure, …
 _MOST_WAVES = 10  # … which has so many half waves at most, …
+_SURELY = 4.0  # of −2 ln L, two standard deviations
 _SLOPE = 2.5  # … and the exponent β of its variance
 _MOST_GROUPS = 20  # exposure groups with a mean of their own
 
@@ -311,8 +312,9 @@ def _fitted(light: OwnLight) -> _Fitted | None:
 def _amplitude(
     matrix: Float[np.ndarray, "m m"], pull: Float[np.ndarray, " m"], prior: Float[np.ndarray, " f"]
 ) -> tuple[float, float]:
-    """a of the largest marginal likelihood, all columns ahead of the cosines fitted, and what numbers these are worth.
+    """The largest a that the marginal likelihood allows, all columns ahead of the cosines fitted; numbers taken.
 
+    Allowed is −2 ln L up to `_SURELY` above its minimum: faint stars hardly know a, and too small a one is an alarm.
     With Λ, t the eigenvalues of the matrix of the cosines and their pulls, −2 ln L = Σ ln(1 + aΛ) − Σ a t²/(1 + aΛ).
     """
     first = len(prior)
@@ -324,7 +326,7 @@ def _amplitude(
     values, t = np.maximum(values, 0.0), axes.T @ (pull[first:] - cross @ (root.T @ pull[:first]))
     tried = np.append(0.0, np.geomspace(1e-9, 1.0, 91))[:, None]
     misfit = np.sum(np.log1p(tried * values) - tried * t**2 / (1.0 + tried * values), axis=1)
-    best = float(tried[int(np.argmin(misfit)), 0])
+    best = float(tried[misfit < misfit.min() + _SURELY, 0].max())
     return best, float(np.sum(best * values / (1.0 + best * values)))
 
 
