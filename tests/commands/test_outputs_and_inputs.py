@@ -11,6 +11,7 @@ from astropy.table import Table
 from camera_files import four, some_stars
 
 import walop_jax as walop
+from walop_jax.commands.command import UsageError
 from walop_jax.io.errors import DataError
 from walop_jax.io.folder import check_apart
 
@@ -25,42 +26,42 @@ def content(path) -> bytes:
 def test_an_output_that_is_an_input_is_refused_and_nothing_is_lost(run, tmp_path):
     files = four(STARS, tmp_path)
     before = content(files[1])
-    with pytest.raises(DataError, match=LOST):
+    with pytest.raises(UsageError, match=LOST):
         walop.gather(files, output=files[1], overwrite=True)
     link = tmp_path / "link.fits"
     link.symlink_to(files[1])
     hard = tmp_path / "hard.fits"
     os.link(files[1], hard)
     for other_name in (link, hard, tmp_path / "." / "E1.fits"):
-        with pytest.raises(DataError, match=LOST):
+        with pytest.raises(UsageError, match=LOST):
             walop.gather(files, output=other_name, overwrite=True)
     assert content(files[1]) == before
     stars = tmp_path / "stars.fits"
     walop.gather(files, output=stars)
-    with pytest.raises(DataError, match=LOST):
+    with pytest.raises(UsageError, match=LOST):
         walop.apply(run, stars, output=stars, overwrite=True)
-    with pytest.raises(DataError, match=LOST):
+    with pytest.raises(UsageError, match=LOST):
         walop.gather(files, gaia=str(stars), output=stars, overwrite=True)
 
 
 def test_a_calibration_that_is_compared_is_not_replaced(run, tmp_path):
     old = shutil.copytree(run, tmp_path / "old")
-    for given in (old, old / "calibration.fits"):
-        with pytest.raises(DataError, match=LOST):
+    for given in (old, old / "calibration.fits", walop.read(old)):
+        with pytest.raises(UsageError, match=LOST):
             walop.epoch(given, "night.fits", output=old, overwrite=True)
 
 
 def test_other_commands_keep_their_inputs(tmp_path):
     plan, truth = tmp_path / "plan.toml", tmp_path / "truth.json"
     plan.write_text("seed = 1\n")
-    with pytest.raises(DataError, match=LOST):
+    with pytest.raises(UsageError, match=LOST):
         walop.simulate(plan, output=tmp_path / "s.fits", truth=plan, overwrite=True)
-    with pytest.raises(DataError, match=LOST):
+    with pytest.raises(UsageError, match=LOST):
         walop.plan(plan, output=tmp_path, overwrite=True)
     with pytest.raises(ValueError, match="is the file of output as well"):
         walop.simulate(output=truth, truth=truth, overwrite=True)
-    with pytest.raises(DataError, match=LOST):
-        walop.clip(plan, output=plan, overwrite=True)
+    with pytest.raises(UsageError, match=LOST):
+        walop.matrix("RUN", points=plan, output=plan, overwrite=True)
 
 
 def test_a_table_in_a_file_is_that_file(tmp_path):

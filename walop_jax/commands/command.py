@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from walop_jax.io.atomic import atomic_path, check_output
-from walop_jax.io.errors import PathLike, nearest
+from walop_jax.io.errors import DataError, PathLike, nearest
 from walop_jax.io.folder import NotWrittenError, OutputFolder, check_apart, output_folder
 from walop_jax.io.names import NIGHTS, PRODUCT
 from walop_jax.io.progress import Stage
@@ -359,20 +359,25 @@ class Command(Generic[T]):
             return outcome.save(folder) if outcome.files or outcome.saved_as else outcome
 
     def _check_apart(self, arguments: Mapping[str, Any]) -> None:
-        """Refuse outputs that are inputs, and two outputs in one file."""
+        """Refuse, as `UsageError`, outputs that are inputs, and two outputs in one file."""
         files = {
             name: path for name in self.outputs if isinstance(path := arguments.get(name), str | os.PathLike)
         }
         read = [
             path for name, given in arguments.items() if name not in self.outputs for path in _paths_in(given)
         ]
+        written = {name: [path] for name, path in files.items()}
         if "output" in files and self.writes and not isinstance(self.writes, str):
             folder = Path(files.pop("output"))
-            check_apart([folder / name for name in self.writes], read)
-            # A survey that grows keeps the nights that it had.
+            written["output"] = [folder / name for name in self.writes]
+            # A survey that grows keeps the nights that it had; any other calibration would be lost.
             if PRODUCT in self.writes and NIGHTS not in self.writes and (folder / PRODUCT).exists():
-                check_apart([folder], [path for path in read if Path(path).is_dir()])
-        check_apart(files.values(), read)
+                written["output"].append(folder)
+        for name, paths in written.items():
+            try:
+                check_apart(paths, read)
+            except DataError as error:
+                raise UsageError(str(error), name) from error
         same: dict[str, str] = {}
         for name, path in files.items():
             if (other := same.setdefault(os.path.realpath(path), name)) != name:
@@ -380,8 +385,9 @@ class Command(Generic[T]):
 
 
 def _paths_in(given: Any) -> list[PathLike]:
-    """The paths that an argument consists of: one, or those in a list."""
-    return [entry for entry in several(given) if isinstance(entry, str | os.PathLike)]
+    """The paths that an argument consists of: one, or those in a list; of a run its folder."""
+    entries = (getattr(entry, "folder", entry) for entry in several(given))
+    return [entry for entry in entries if isinstance(entry, str | os.PathLike)]
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

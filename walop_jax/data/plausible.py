@@ -42,7 +42,7 @@ _LIKE = 0.25  # of the usual counts, of one that began anew
 _NEGATIVE = 5.0  # standard errors
 
 
-class Doubt(NamedTuple):
+class Implausible(NamedTuple):
     """A sentence about a column."""
 
     column: str
@@ -54,7 +54,7 @@ def today() -> float:
     return time.time() / 86400.0 + 40587.0
 
 
-def of_columns(columns: Mapping[str, np.ndarray], now: float = np.inf) -> Iterator[Doubt]:
+def of_columns(columns: Mapping[str, np.ndarray], now: float = np.inf) -> Iterator[Implausible]:
     """Doubts about MJD, EXPTIME, TEMP, ROTATOR, CHWP_ANGLE, RA and DEC, those that there are; `now` is a date (MJD)."""
     nothing = np.zeros(0)
     mjd = columns.get("MJD", nothing)
@@ -65,51 +65,53 @@ def of_columns(columns: Mapping[str, np.ndarray], now: float = np.inf) -> Iterat
         yield from of_angles(name, columns.get(name, nothing))
     ra, dec = (columns.get(name, nothing) for name in ("RA", "DEC"))
     if len(ra) == len(dec) and np.any(unset := (ra == 0.0) & (dec == 0.0)):
-        yield Doubt("RA, DEC", f"are both 0 in {_rows(unset)}: were they not set? Write NaN where not known")
+        yield Implausible(
+            "RA, DEC", f"are both 0 in {_rows(unset)}: were they not set? Write NaN where not known"
+        )
 
 
-def of_times(mjd: Numbers, now: float = np.inf) -> Iterator[Doubt]:
+def of_times(mjd: Numbers, now: float = np.inf) -> Iterator[Implausible]:
     """Doubts about dates (MJD, d): before 1990, in the future, of a clock that was not set."""
     known = np.isfinite(mjd)
     zero = known & np.isin(mjd, list(_ZEROS))
     if zero.any():
         which = _ZEROS[float(mjd[zero][0])]
         what = f"is {mjd[zero][0]:g} in {_rows(zero)}: a clock that was not set ({which})?"
-        yield Doubt("MJD", f"{what} Write NaN where the time is not known")
+        yield Implausible("MJD", f"{what} Write NaN where the time is not known")
     year = known & (mjd > _YEARS[0]) & (mjd < _YEARS[1])
     if year.any():
-        yield Doubt(
+        yield Implausible(
             "MJD", f"is {mjd[year][0]:g} in {_rows(year)}: is this a year? Give Modified Julian Dates"
         )
     if np.any(old := known & (mjd < OLDEST) & ~zero & ~year):
-        yield Doubt("MJD", f"is before 1990 in {_rows(old)}; write NaN where the time is not known")
+        yield Implausible("MJD", f"is before 1990 in {_rows(old)}; write NaN where the time is not known")
     if np.any(late := known & (mjd > now + 2.0)):
         what = f"lies in the future in {_rows(late)}, at {mjd[late].max():.6g}"
-        yield Doubt(
+        yield Implausible(
             "MJD", f"{what} (today is {now:.0f}): is it a Modified Julian Date, and was the clock set?"
         )
 
 
-def of_campaign(mjd: Numbers) -> Iterator[Doubt]:
+def of_campaign(mjd: Numbers) -> Iterator[Implausible]:
     """Doubts about exposures of one set that are years apart."""
     if not np.isfinite(mjd).any():
         return
     middle = np.nanmedian(mjd)
     if np.any(far := np.abs(mjd - middle) > CAMPAIGN):
         what = f"is more than {CAMPAIGN:g} days from the median, {middle:.1f}, in {_rows(far)}"
-        yield Doubt("MJD", f"{what}; correct it, or calibrate the epochs one by one")
+        yield Implausible("MJD", f"{what}; correct it, or calibrate the epochs one by one")
 
 
-def of_exposure_times(exptime: Numbers, mjd: Float[np.ndarray, " m"]) -> Iterator[Doubt]:
+def of_exposure_times(exptime: Numbers, mjd: Float[np.ndarray, " m"]) -> Iterator[Implausible]:
     """Doubts about exposure times (s): milliseconds, by their length or by the dates (MJD, d) of the exposures."""
     known = np.isfinite(exptime)
     if not known.any():
         return
     if np.any(none := known & (exptime == 0.0)):
-        yield Doubt("EXPTIME", f"is 0 in {_rows(none)}: no light; write NaN where it is not known")
+        yield Implausible("EXPTIME", f"is 0 in {_rows(none)}: no light; write NaN where it is not known")
     if np.any(long := exptime > _LONGEST):
         what = f"is up to {exptime[long].max():g} s in {_rows(long)}"
-        yield Doubt("EXPTIME", f"{what}: are these milliseconds? Seconds are wanted")
+        yield Implausible("EXPTIME", f"{what}: are these milliseconds? Seconds are wanted")
         return
     if len(mjd) != len(exptime):
         return
@@ -121,10 +123,10 @@ def of_exposure_times(exptime: Numbers, mjd: Float[np.ndarray, " m"]) -> Iterato
     if later.sum() >= 2 and np.median(between[later] / apart[later]) > _MILLISECONDS:
         factor = np.median(between[later] / apart[later])
         what = f"is {factor:.2g} times as long as the exposures lie apart by MJD"
-        yield Doubt("EXPTIME", f"{what}: are these milliseconds? Seconds are wanted")
+        yield Implausible("EXPTIME", f"{what}: are these milliseconds? Seconds are wanted")
 
 
-def of_temperatures(celsius: Numbers) -> Iterator[Doubt]:
+def of_temperatures(celsius: Numbers) -> Iterator[Implausible]:
     """Doubts about temperatures: of no instrument, or far from those of the other exposures."""
     known = np.isfinite(celsius)
     if not known.any():
@@ -132,24 +134,28 @@ def of_temperatures(celsius: Numbers) -> Iterator[Doubt]:
     low, high = _TEMPERATURES
     if np.any(odd := known & ((celsius < low) | (celsius > high))):
         what = f"is {celsius[odd][0]:g} Celsius in {_rows(odd)}, of no instrument"
-        yield Doubt(
+        yield Implausible(
             "TEMP", f"{what}: a number that stands for not known, or a sensor that is off? Write NaN there"
         )
     rest = known & ~odd
     if rest.any() and np.any(far := rest & (np.abs(celsius - np.median(celsius[rest])) > _APART)):
         what = f"is {celsius[far][0]:g} Celsius in {_rows(far)}, {np.median(celsius[rest]):.3g} in the others"
-        yield Doubt("TEMP", f"{what}: a sensor that is off, or Fahrenheit? Write NaN where it is not known")
+        yield Implausible(
+            "TEMP", f"{what}: a sensor that is off, or Fahrenheit? Write NaN where it is not known"
+        )
 
 
-def of_angles(name: str, degrees: Numbers, *, radians: bool = True) -> Iterator[Doubt]:
+def of_angles(name: str, degrees: Numbers, *, radians: bool = True) -> Iterator[Implausible]:
     """Doubts about angles: beyond a turn, or `radians`."""
     known = np.isfinite(degrees)
     if np.any(beyond := known & (np.abs(degrees) > 360.0)):
         what = f"is beyond a turn in {_rows(beyond)}, up to {np.abs(degrees[beyond]).max():g} deg"
-        yield Doubt(name, f"{what}: an encoder that counts turns, or steps? Angles are taken modulo 360 deg")
+        yield Implausible(
+            name, f"{what}: an encoder that counts turns, or steps? Angles are taken modulo 360 deg"
+        )
     if radians and like_radians(degrees[known]):
         what = f"lies between {degrees[known].min():.4g} and {degrees[known].max():.4g} in all rows"
-        yield Doubt(name, f"{what}: are these radians? Angles are in degrees")
+        yield Implausible(name, f"{what}: are these radians? Angles are in degrees")
 
 
 def like_radians(angles: np.ndarray) -> bool:
@@ -174,7 +180,7 @@ def of_counts(
     measured: Used | None = None,
     group: Groups | None = None,
     cameras: Sequence[str] = (),
-) -> Iterator[Doubt]:
+) -> Iterator[Implausible]:
     """Doubts about counts (electrons) and errors of cameras, of the rows that are `used`; `measured` are photons.
 
     Errors above the counts, or ten times off the noise of photons; values that stand at the ceiling of a detector;
@@ -185,7 +191,7 @@ def of_counts(
     yield from of_wraps(counts, sigma, group, cameras)
 
 
-def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Doubt]:
+def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Implausible]:
     """Doubts about standard errors, by those of photons √N in the brightest tenth, where the sky matters least."""
     good = used[:, None] & np.isfinite(counts) & np.isfinite(sigma) & (counts > 0) & (sigma > 0)
     if good.sum() < _FEWEST_FULL:
@@ -193,7 +199,7 @@ def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Doubt]:
     n, e = counts[good], sigma[good]
     if np.mean(e > n) > _MOST:
         what = f"is above N in {100.0 * np.mean(e > n):.0f} % of all values (median N_ERR/N {np.median(e / n):.3g})"
-        yield Doubt("N_ERR", f"{what}: are the columns exchanged, or is N a rate and N_ERR not?")
+        yield Implausible("N_ERR", f"{what}: are the columns exchanged, or is N a rate and N_ERR not?")
         return
     bright = n >= np.quantile(n, 0.9)
     n, e = n[bright], e[bright]
@@ -205,10 +211,10 @@ def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Doubt]:
             if like
             else "are N and N_ERR in electrons, or in counts (multiply by the gain)?"
         )
-        yield Doubt("N_ERR", f"is {np.sqrt(ratio):.3g} times the noise of photons √N (median): {cause}")
+        yield Implausible("N_ERR", f"is {np.sqrt(ratio):.3g} times the noise of photons √N (median): {cause}")
 
 
-def of_ceilings(counts: Counts, used: Used, cameras: Sequence[str] = ()) -> Iterator[Doubt]:
+def of_ceilings(counts: Counts, used: Used, cameras: Sequence[str] = ()) -> Iterator[Implausible]:
     """Doubts about values that are exactly the largest of their camera in several rows: a detector that is full."""
     for camera in range(counts.shape[1]):
         values = np.where(used & np.isfinite(counts[:, camera]), counts[:, camera], -np.inf)
@@ -218,12 +224,12 @@ def of_ceilings(counts: Counts, used: Used, cameras: Sequence[str] = ()) -> Iter
         different = len(np.unique(counts[full], axis=0))
         if len(full) >= _FEWEST_FULL and 2 * different > len(full):
             what = f"is exactly {top:.10g}, the largest, in {rows_text(full)} of {_named(camera, cameras)}"
-            yield Doubt("N", f"{what}: the ceiling of the detector? Set FLAG 1 (saturated) there")
+            yield Implausible("N", f"{what}: the ceiling of the detector? Set FLAG 1 (saturated) there")
 
 
 def of_wraps(
     counts: Counts, sigma: Counts, group: Groups | None = None, cameras: Sequence[str] = ()
-) -> Iterator[Doubt]:
+) -> Iterator[Implausible]:
     """Doubts about values that would be like others with 65536 more: of a counter of 16 bits that began anew.
 
     Others are those of the same camera and `group`, such as an exposure, whose counts are alike; without groups, where
@@ -248,7 +254,7 @@ def of_wraps(
         if len(rows) >= (1 if negative[rows].any() else _FEWEST_WRAPPED):
             where = f"{rows_text(rows)} of {_named(camera, cameras)}"
             what = f"is {n[rows[0]]:.6g} in {where}, where {expected[rows[0]]:.6g} would be usual"
-            yield Doubt("N", f"{what}: a counter of 16 bits that began anew? Add 65536, or set FLAG 1")
+            yield Implausible("N", f"{what}: a counter of 16 bits that began anew? Add 65536, or set FLAG 1")
 
 
 def _named(camera: int, cameras: Sequence[str]) -> str:
