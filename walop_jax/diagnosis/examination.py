@@ -385,14 +385,16 @@ def examine(
     """Score effects that a model has not, sentences and patterns against a fit.
 
     Descriptions that say what another candidate says are names of that one (`synonyms`). `earlier` is of a smaller
-    model; its columns serve again where the light has hardly changed.
+    model: its names hold here, and its columns serve again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    known: Mapping[str, tuple[str, ...]] | None = None
+    known = None if earlier is None else earlier.also
     if earlier is not None and earlier.is_like(design):
-        computed, known = earlier.candidates, earlier.also
+        computed = earlier.candidates
     else:
-        computed = all_candidates(design.columns, hypotheses.beside(active))
+        other_names = set(itertools.chain(*(known or {}).values()))
+        wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
+        computed = all_candidates(design.columns, wanted)
     probes = [p for p in hypotheses.names if p.name in computed and p.effect.name not in active]
     sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
     parts = [

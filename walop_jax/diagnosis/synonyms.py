@@ -5,14 +5,14 @@ Data        Behind the free parameters the columns C of two candidates with k am
 Product     What both do to the instrument matrix, refitted, is the same: with D the change of the matrix by the
             amplitudes, directly and through the shift of the free parameters, and b = T a the amplitudes of the first
             candidate that imitate amplitudes a of the second one best, D₂ a − D₁ T a is less than `ALIKE` of the errors
-            of the matrix, rms over the field points, for each number at its prior width.
+            of the matrix for N_ERR as stated, rms over the field points, for each number at its prior width.
 Names       A name of the catalogue goes before a description, a description of a KIND of exposures (which may as well
             be that of all other kinds, `class_members`) before others, the shorter before the longer; the candidate
             keeps the prior widths of the name it has. Names of the catalogue remain apart from each other: each is an
             effect of its own, and reported as indistinguishable.
 
-Synonyms stay synonyms where further parameters are free: what is nearly parallel to another column is so behind any
-projection. Source: Björck & Golub 1973, Math. Comp. 27, 579 (angles between spans).
+Synonyms stay synonyms where further parameters are free, which take up both or neither. Source: Björck & Golub 1973,
+Math. Comp. 27, 579 (angles between spans).
 """
 
 from __future__ import annotations
@@ -123,7 +123,8 @@ def _changes(
     matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x, points.y)
     slopes = slopes.reshape(len(matrix), -1, slopes.shape[-1]) @ fit.model.selection()
     covariance = fit.covariance[np.ix_(fit.model.free, fit.model.free)]
-    errors = np.sqrt(np.einsum("pmf,fg,pmg->pm", slopes, covariance, slopes))
+    # Of data as stated: of a fit that is far off any two products would be the same.
+    errors = np.sqrt(np.einsum("pmf,fg,pmg->pm", slopes, covariance, slopes)) / fit.noise_scale
     columns = [candidates[name].columns for name in sums]
     taken_up = design.projector.taken_up(design.products(columns, design.projector.basis).T)
     ends = np.cumsum([len(of) for of in sums.values()])[:-1]
