@@ -15,7 +15,14 @@ from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
-from walop_jax.diagnosis.class_product import Classes, _with_ties, averaged, only_a_class
+from walop_jax.diagnosis.class_product import (
+    Classes,
+    ClassOf,
+    Likeness,
+    _with_ties,
+    averaged,
+    only_a_class,
+)
 from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.refits import settled
 from walop_jax.fit.base_model import base_model
@@ -25,7 +32,7 @@ from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.effects.change import Change
 from walop_jax.model.specification import with_effects
 from walop_jax.posterior.run import Run
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +122,7 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     laid = Laid(class_scene.examined())
     sums = (((1.0, Change.parsed("gain of O1 * hours")),),)
 
-    def candidates(step, addition, alike):
+    def candidates(step, addition, alike, whole):
         rival = step.member("", sums, laid.design.stacked([laid.columns.of(sums)]), np.array([3e-3]))
         return addition.evidence, [
             (rival._replace(evidence=addition.evidence - less, change=10.0 * k * laid.errors), False)
@@ -143,6 +150,59 @@ def test_what_was_added_is_in_its_class_once():
     state = examined_with(result, (own, other).__contains__)
     (found,) = ambiguities(state, {own: ()}).additions
     assert [member.name for member in found.members] == [own, other]
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """HWP2 turned by 0.06°, fitted by its name; the description of the axes of both plates is asked beside it."""
+    turn = effect_from_text("hwp2_axis=0.06", SMALL.context())
+    return examined_with(
+        fit_with(simulate(SMALL, seed=4, effects=[turn]).calset, turn),
+        lambda name: name.startswith("axis of half"),
+    )
+
+
+def test_a_change_of_one_name_is_not_shared_with_a_longer_description_of_it(turned):
+    """The axes of both plates say all that the name says, and one number more, which is zero: 0.06° is one change."""
+    asked = {probe.name for probe in turned.sentences}
+    assert "axis of half1.plate; axis of half2.plate" in asked
+    fit = turned.result
+    value, error = fit.value("hwp2_axis.angle")
+    assert value == pytest.approx(0.06, abs=4 * error)
+    product = averaged(Calibration.from_fit(fit.judged()), ambiguities(turned, {"hwp2_axis": ()}))
+    at = product.model.index("hwp2_axis.angle")
+    assert product.values[at] == pytest.approx(value, abs=0.1 * error)
+    assert np.sqrt(product.covariance[at, at]) < 3.0 * error
+
+
+def test_members_that_say_a_name_in_other_words_move_its_parameter(turned):
+    """A member that turns the plate by b, as probable as the fit: a ± s. The angle is ½ (a + b), all else as it was.
+
+    By the law of total variance its variance is ½ s² + ½ t² + ¼ (a − b)².
+    """
+    fit, text = turned.result, "axis of half2.plate"
+    a, s = fit.value("hwp2_axis.angle")
+    b, t, zero = 0.05, 0.001, np.zeros(len(fit.model.free))
+    at = turned.design.columns_of(fit.model.positions("hwp2_axis"))
+    back = zero.copy()
+    back[at] = -a
+    sums = (((1.0, Change.parsed(text)),),)
+    none = np.zeros((len(fit.calset.points), 6))
+    members = (
+        Likeness("hwp2_axis", 0.0, sums, none, probability=0.5),
+        Likeness(
+            text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5
+        ),
+    )
+    alone = Calibration.from_fit(fit.judged())
+    product = averaged(alone, Classes(additions=(ClassOf("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
+    assert product.model.names == alone.model.names
+    place = product.model.index("hwp2_axis.angle")
+    assert product.values[place] == pytest.approx(0.5 * (a + b), rel=1e-12)
+    variance = 0.5 * (s**2 + t**2) + 0.25 * (a - b) ** 2
+    assert product.covariance[place, place] == pytest.approx(variance, rel=1e-9)
+    others = np.arange(len(product.values)) != place
+    np.testing.assert_array_equal(product.values[others], alone.values[others])
 
 
 def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_plate_that_slips_is_told_with_its_time():
     ((change, value, sigma),) = step.descriptions
     start = float(re.fullmatch(r"hours (\S+) to \S+", change.factors[0])[1])
     assert start == pytest.approx((SLIPPED - 0.5) * MINUTES / 60.0, abs=1e-3)
-    others = " ".join((change.text, *step.nameless))
+    others = " ".join((change.text, *step.nameless, *itertools.chain(*step.also_called.values())))
     assert "turn of hwp" in others
     assert "turn of polariser" in others
     assert abs(value) == pytest.approx(0.6, abs=4.0 * sigma)

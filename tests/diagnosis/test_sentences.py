@@ -1,5 +1,6 @@
 """What nobody has a name for is told in a sentence: kind, place and dependence, with its size."""
 
+import itertools
 import json
 from typing import ClassVar
 
@@ -70,7 +71,7 @@ def test_an_encoder_error_twice_per_turn():
     result = found([Described.saying(["turn of polariser * sin 2 CLP"], [0.08])])
     step = result.steps[0]
     said = {change.text for change, _, _ in step.descriptions} | {
-        t for text in step.nameless for t in text.split("; ")
+        t for text in itertools.chain(step.nameless, *step.also_called.values()) for t in text.split("; ")
     }
     assert "turn of polariser * sin 2 CLP" in said
     assert result.verdict == "effect_found"

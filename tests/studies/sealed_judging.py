@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -158,7 +159,7 @@ def right_of(one: Sealed, diagnosis: Diagnosis) -> str:
     told, classes = [], []
     for step in diagnosis.steps:
         told += [change.text for change, *_ in step.descriptions] if step.descriptions else [step.effect]
-        classes += [*step.equivalent, *step.nameless]
+        classes += [*step.equivalent, *step.nameless, *itertools.chain(*step.also_called.values())]
     if homes(told) <= one.homes:
         return "right"
     return "class" if homes([*told, *classes]) & one.homes else "wrong"

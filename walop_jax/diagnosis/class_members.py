@@ -36,13 +36,13 @@ from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import sentences_of
 from walop_jax.diagnosis.score import FAINTEST, Matrix, Vector, log_bayes
+from walop_jax.diagnosis.synonyms import ALIKE
 from walop_jax.fit.refit import PRIOR_EDGE
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
 
-ALIKE = 0.5  # of the errors of the matrix: members that differ by less count as one
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step
 PLAUSIBLE = 0.02  # probability of members in the check of the farthest
@@ -63,7 +63,7 @@ def classes_of(
         at = design.columns_of(model.positions(effect.name))
         if effect.name in added and not effect.kind.is_structural() and len(at):
             change, sums = signature(fit, effect.name), tuple(map(tuple, effect.first_order(model.template)))
-            classes.append(laid.class_of(effect.name, at, change, sums, added[effect.name]))
+            classes.append(laid.class_of(effect.name, at, change, sums, added[effect.name], frozenset()))
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
             sentences = [Sentence.parsed(text) for text in group]
             at = design.columns_of(
@@ -72,7 +72,8 @@ def classes_of(
             if len(at):
                 change = -design.jacobian[: design.rows, at] @ fit.values[model.free[at]]
                 sums = tuple(((1.0, sentence),) for sentence in sentences)
-                classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ())))
+                whole = frozenset((*name.split("; "), *group))
+                classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ()), whole))
     return tuple(group for group in classes if group.names)
 
 
@@ -136,14 +137,16 @@ class Laid:
         lost: Vector,
         sums: tuple[Sum, ...],
         alike: Collection[str],
+        whole: frozenset[str],
     ) -> ClassOf:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`.
 
         `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
+        `whole` is the group of sentences that it is what remains of; empty for an effect with a name.
         """
         step = LinearStep(self, at, lost)
         addition, widths = step.addition(name, sums)
-        best, rivals = step.candidates(addition, alike)
+        best, rivals = step.candidates(addition, alike, whole)
         # Exact fits chose the addition: where it is less probable by one linear step, the step is inaccurate.
         by_step, members = [addition, *(member for member, _ in rivals)], [addition._replace(evidence=best)]
         for member, is_alike in rivals:
@@ -228,12 +231,13 @@ class LinearStep:
         return Likeness(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
     def candidates(
-        self, addition: Likeness, alike: Collection[str]
+        self, addition: Likeness, alike: Collection[str], whole: frozenset[str]
     ) -> tuple[float, list[tuple[Likeness, bool]]]:
-        """The best evidence, and candidates not improbable relative to it; `alike` as in `class_of`.
+        """The best evidence, and candidates not improbable relative to it; `alike` and `whole` as in `class_of`.
 
         True stands beside those that are among `alike`. What the model has beside the addition replaces nothing. Of a
-        group that was added, sentences that nothing shows were dropped since: the group is compared with other groups.
+        group that was added, sentences that nothing shows were dropped since: it is the whole group that is compared
+        with other groups, and the group is no member beside what remains of it.
         """
         state, design, texts = self.laid.state, self.laid.design, _texts(addition.sums)
         gram, scores = state.space_beside(self.basis)[1].gram, design.products(state.columns, self.left)
@@ -246,8 +250,8 @@ class LinearStep:
             evidence = log_bayes(square, scores[at], probe.widths) / state.floor**2
             scored.append((evidence, bool({probe.name, probe.effect.name} & set(alike)), probe))
         scored.sort(key=lambda item: -item[0])
-        groups = (item for item in scored if item[2].effect is Described)
-        larger = [evidence for evidence, _, probe in groups if set(sentences_of(probe)) > texts]
+        groups = [item for item in scored if item[2].effect is Described]
+        larger = [evidence for evidence, _, probe in groups if set(sentences_of(probe)) > texts and whole]
         best = max([min([addition.evidence, *larger[:1]]), *(evidence for evidence, *_ in scored[:1])])
         least, chosen = best - thresholds.IMPROBABLE, []
         for evidence, close, probe in scored:
@@ -263,8 +267,9 @@ class LinearStep:
             sums = tuple(
                 tuple(total) for member in probe.group for total in member.first_order(self.laid.template)
             )
-            # The addition is among the candidates: it is no further member.
-            if len(sums) == len(probe.widths) and _texts(sums) != texts and self._can_be_said(sums):
+            # The addition is among the candidates, by itself or as a whole: it is no further member.
+            own = _texts(sums) in (texts, whole)
+            if len(sums) == len(probe.widths) and not own and self._can_be_said(sums):
                 chosen.append((probe, evidence, close, sums))
         self.laid.added([total for *_, sums in chosen for total in sums])  # all of them in one go
         members = []

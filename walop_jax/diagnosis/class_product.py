@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -164,10 +164,11 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     if not classes:
         return calibration
     old, model = calibration.model, _holding(calibration, classes)
+    said = _said_by_name(old)
     parts = [p.part for p in model.parameters]
     new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
     if new:
-        model = _with_ties(model, new, _derivatives(model, Described.name, classes.sums))
+        model = _with_ties(model, new, _derivatives(model, Described.name, classes.sums, said))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, fitted = np.zeros(count), np.zeros((count, count))
@@ -181,7 +182,7 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
         conditional = into @ known_apart_from(of_free, group.at) @ into.T
         means, errors = [start], [fitted]
         for member in group.members[1:]:
-            amplitudes = _derivatives(model, Described.name, member.sums)
+            amplitudes = _derivatives(model, Described.name, member.sums, said)
             slopes = into @ member.slopes + amplitudes
             means.append(start + into @ member.values + amplitudes @ member.amplitudes)
             errors.append(conditional + slopes @ member.covariance @ slopes.T)
@@ -210,9 +211,10 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
 
 
 def _holding(calibration: Calibration, classes: Classes) -> Model:
-    """The model with the sentences of all members, and with deviations."""
-    texts = dict.fromkeys(sentence.text for sentence in sentences_in(classes.sums))
+    """The model with the sentences of all members that no effect of it says by a name, and with deviations."""
     model = calibration.model
+    said = _said_by_name(model)
+    texts = dict.fromkeys(s.text for s in sentences_in(classes.sums) if s.text not in said)
     context = effect_context(model.template, calibration.exposures)
     if (effect := classes.deviations(model, context)) is not None:
         model = with_effects(model, [effect], context)
@@ -222,12 +224,36 @@ def _holding(calibration: Calibration, classes: Classes) -> Model:
     return with_sentences(model, description, context)
 
 
-def _derivatives(model: Model, effect: str, sums: Sequence[Sum]) -> Float[np.ndarray, "n a"]:
-    """Derivative of all parameters by amplitudes, each a sum of changes that an effect of the model holds."""
+def _said_by_name(model: Model) -> dict[str, tuple[str, float]]:
+    """Parameters of effects with a name that are the amplitude of one sentence, and its coefficient, by the sentence.
+
+    What moves in a member of a class is then that parameter, and not a description of the same change beside it.
+    """
+    said: dict[str, tuple[str, float]] = {}
+    for effect in model.template.effects:
+        if isinstance(effect, Described | Deviations) or effect.kind.is_structural():
+            continue
+        names = [f"{effect.name}.{label}" for f in effect.kind.amplitudes() for label in effect.labels(f)]
+        amplitudes = effect.first_order(model.template)
+        for name, terms in zip(names, amplitudes, strict=False) if len(names) == len(amplitudes) else ():
+            if len(terms) == 1 and name in model.names and model[name].free and model[name].tie is None:
+                ((coefficient, sentence),) = terms
+                said.setdefault(sentence.text, (name, coefficient))
+    return said
+
+
+def _derivatives(
+    model: Model, effect: str, sums: Sequence[Sum], said: Mapping[str, tuple[str, float]] | None = None
+) -> Float[np.ndarray, "n a"]:
+    """Derivative of all parameters by amplitudes, each a sum of changes that an effect of the model holds.
+
+    Sentences that are `said` by a parameter of another effect (`_said_by_name`) change that.
+    """
     derivatives = np.zeros((len(model.parameters), len(sums)))
     for j, combination in enumerate(sums):
         for size, sentence in combination:
-            derivatives[model.index(f"{effect}.{sentence.label}"), j] += size
+            name, coefficient = (said or {}).get(sentence.text, (f"{effect}.{sentence.label}", 1.0))
+            derivatives[model.index(name), j] += size / coefficient
     return derivatives
 
 

@@ -53,7 +53,8 @@ class Trial:
     `nameless` sentences that are not improbable beside it. `predicts` is False where its linear step does not predict
     held-out data, `compared` are the fits without and with it (`refits.before_and_after`), `against` the KINDs of
     exposures that contradict it, `refused` the reason for which it was not added, `groups` the groups of sentences that
-    were added one after the other, each with the candidates that were as good then.
+    were added one after the other, each with the candidates that were as good then. `also` are the other names of it
+    and of what is beside it (`synonyms`).
     """
 
     effect: EffectKind
@@ -73,6 +74,7 @@ class Trial:
     against: str = ""
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:

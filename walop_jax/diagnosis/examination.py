@@ -35,6 +35,7 @@ from walop_jax.diagnosis.score import (
     log_bayes,
     separations,
 )
+from walop_jax.diagnosis.synonyms import synonyms
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.likelihood import limits
@@ -106,7 +107,8 @@ class Evidence:
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are reported as
     the effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
-    `dof` are those of the fit, `scale` the factor on the errors with which it was made.
+    `dof` are those of the fit, `scale` the factor on the errors with which it was made. `also` are the other names of
+    candidates (`synonyms`).
     """
 
     space: ScoreSpace
@@ -120,6 +122,7 @@ class Evidence:
     chi2: float
     dof: int
     scale: float = 1.0
+    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     @property
     def asked(self) -> tuple[Probe, ...]:
@@ -381,13 +384,17 @@ def examine(
 ) -> Examination:
     """Score effects that a model has not, sentences and patterns against a fit.
 
-    `earlier` is of a smaller model; its columns serve again where the light has hardly changed.
+    Descriptions that say what another candidate says are names of that one (`synonyms`). `earlier` is of a smaller
+    model: its names hold here, and its columns serve again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
+    known = None if earlier is None else earlier.also
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
-        computed = all_candidates(design.columns, hypotheses.beside(active))
+        other_names = set(itertools.chain(*(known or {}).values()))
+        wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
+        computed = all_candidates(design.columns, wanted)
     probes = [p for p in hypotheses.names if p.name in computed and p.effect.name not in active]
     sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
     parts = [
@@ -406,7 +413,14 @@ def examine(
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
     bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
+    if known is None:
+        known = synonyms(design, bare, candidates, (*probes, *sentences))
+        if said := set(itertools.chain(*known.values())):
+            sentences = tuple(probe for probe in sentences if probe.name not in said)
+            names = [name for name in names if name not in said]
+            candidates, bare = {name: candidates[name] for name in names}, bare.subset(names)
     r = design.projector(design.residual)
+    columns = [candidate.columns for candidate in candidates.values()]
     space, scores, square = bare, design.products(columns, r), float(r @ r)
     if SINGLE_EXPOSURES in names:
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode(bare, design))
@@ -427,6 +441,7 @@ def examine(
         design=design,
         candidates=candidates,
         bare=bare,
+        also=known,
     )
 
 

@@ -185,6 +185,7 @@ class Step(FitComparison):
     that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
     is the distance (σ) of each rival from it. `descriptions` are the sentences of an effect without a name
     (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
+    `also_called` are other names of it and of those, by name (`synonyms`).
     """
 
     effect: str
@@ -202,6 +203,7 @@ class Step(FitComparison):
     where: dict[str, Any] = dataclasses.field(default_factory=dict)
     descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
+    also_called: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -395,7 +397,8 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
-    "alternatives", "equivalent", "nameless", "separated_by", "where", "confirmed", "log_bayes", "negligible",
+    "alternatives", "equivalent", "nameless", "also_called", "separated_by", "where", "confirmed", "log_bayes",
+    "negligible",
 )  # fmt: skip
 
 
@@ -465,6 +468,10 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
             .replace("clp harmonic", "harmonic of the polariser angle")
         )
         yield f"{name}, share of the misfit that it removes, by {words}"
+    others = step.get("also_called", {})
+    for called in (name, *(sentence["sentence"] for sentence in step.get("sentences", ()))):
+        if called in others:
+            yield f"{called}: also called {some(others[called], thresholds.SHOWN)}, which is the same change"
     rivals = (*step.get("equivalent", ()), *step.get("nameless", ()))
     if rivals:
         yield f"{name}: these data cannot distinguish it from {some(rivals, thresholds.SHOWN)}"

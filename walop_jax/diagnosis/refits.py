@@ -137,7 +137,7 @@ class Refits:
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
         compared, alike = trial.compared, (*trial.rivals, *trial.nameless)
-        groups = {trial.name: alike} if trial.effect is Described else {}
+        groups, also = {trial.name: alike} if trial.effect is Described else {}, trial.also
         if result is not trial.fit:
             compared = before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
@@ -151,8 +151,9 @@ class Refits:
             compared = dataclasses.replace(
                 compared, **{key: getattr(earlier.compared, key) for key in before}
             )
-            groups = {**earlier.groups, **groups}
-        step = dataclasses.replace(trial, compared=compared, score=score, p_value=p_value, groups=groups)
+            groups, also = {**earlier.groups, **groups}, {**earlier.also, **also}
+        found = {"compared": compared, "score": score, "p_value": p_value, "groups": groups, "also": also}
+        step = dataclasses.replace(trial, **found)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
 

@@ -245,7 +245,9 @@ def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Tr
     nameless = () if item is None else evidence.nameless(item, trial.sentences)
     rivals += () if item is None else evidence.held_in_part(item)
     others = tuple(dict.fromkeys(rivals))
-    return dataclasses.replace(trial, alternatives=tuple(shapes), rivals=others, nameless=nameless)
+    named = {trial.name: "" if item is None else item.probe.name, **{name: name for name in nameless}}
+    also = {name: evidence.also[probe] for name, probe in named.items() if probe in evidence.also}
+    return dataclasses.replace(trial, alternatives=tuple(shapes), rivals=others, nameless=nameless, also=also)
 
 
 def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Reason]:

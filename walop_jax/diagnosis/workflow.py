@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -127,7 +127,7 @@ def diagnose(
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=_members(first, state, steps),
         rounds=state.rounds,
-        not_scored=_not_scored(catalogue, candidates),
+        not_scored=_not_scored(catalogue, candidates, first.evidence.also),
         descriptions=len(candidates.sentences) + len(candidates.parts),
     )
     tables = first.evidence.table, evidence.table
@@ -171,8 +171,10 @@ def _examined(
     return dataclasses.replace(diagnosis, before=before, after=after)
 
 
-def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict[str, str]:
-    """Everything that was not scored, by name, each with the reason."""
+def _not_scored(
+    catalogue: Sequence[EffectKind], candidates: Hypotheses, also: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
+    """Everything that was not scored by itself, by name, each with the reason; `also` are names of other candidates."""
     probed = {probe.effect for probe in candidates.names}
     scored = {probe.name for probe in candidates.beside(())}
     absent = [kind.name for kind in catalogue if kind not in candidates.effects]
@@ -186,7 +188,12 @@ def _not_scored(catalogue: Sequence[EffectKind], candidates: Hypotheses) -> dict
         elif effect not in probed:
             reasons[effect.name] = "the exposures have nothing that it acts on"
     name = "it is an effect of the catalogue by another name"
-    return reasons | {probe.name: name for probe in candidates.every if probe.name not in scored}
+    reasons |= {probe.name: name for probe in candidates.every if probe.name not in scored}
+    return reasons | {
+        other: f"in these data and in its effect on stars it is {called} by another name"
+        for called, others in also.items()
+        for other in others
+    }
 
 
 def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step:
@@ -207,6 +214,7 @@ def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step
         parameters=parameters,
         log_bayes=trial.evidence,
         nameless=trial.nameless,
+        also_called=trial.also,
         alternatives=trial.alternatives,
         score=trial.score,
         p_value=trial.p_value,
