@@ -344,8 +344,15 @@ def _within(
         problem = dataclasses.replace(experiment, families=families, budget=remaining)
         weight = weights.weight[at] * remaining / budget
         scaled = dataclasses.replace(weights, family=family, place=place, weight=weight)
-        integer = optimal.rounded(problem, scaled)
-        integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
+        if required and remaining < min(_cost(problem, {at: 1.0}) for at in scaled.weights):
+            # Those required are all that the time pays for.
+            value = largest_variance(experiment, experiment.known)
+            integer = dataclasses.replace(
+                weights, family=family[:0], place=[], weight=weight[:0], value=value
+            )
+        else:
+            integer = optimal.rounded(problem, scaled)
+            integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
         both = _together(integer, required)
         lines = _ordered(found, both.weights)
         between = sum(_changes(found, lines))
