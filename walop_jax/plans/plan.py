@@ -39,7 +39,8 @@ from walop_jax.plans.exposure_plan import ExposurePlan, PlannedExposure
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import GAP, Allocation, Experiment, NotEstimableError
 from walop_jax.science.field_accuracy import known_in_half
-from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop
+from walop_jax.simulation.polariser_angles import polariser_turn
 from walop_jax.sky.directions import separation
 
 _NOTHING = 1e-6  # of the prior information: less of it makes no plan
