@@ -229,6 +229,15 @@ def test_a_time_that_does_not_pay_for_a_go(small, field):
     assert repr(plan).startswith("No go with this plan alone: ")
 
 
+def test_a_time_that_pays_for_a_go_alone(small, field):
+    """Two Moon patches with the way between them take 4.5 minutes, eight directions 6.7."""
+    plan = plan_from(small, 11.7, criterion_by_name(small, field, "worst"), field)
+    assert plan.lacks == ()
+    assert turn_of(plan.observing_plan.exposures())[0] == 8
+    assert {line.kind for line in plan.lines if line.needed} == {"clp", "moon"}
+    assert plan.seconds <= 60 * 11.7
+
+
 def test_what_a_calibration_has_already_counts(small, field):
     """Ten minutes beside a run with the sky and eight directions over a full turn are as they were."""
     criterion = criterion_by_name(small, field, "worst")

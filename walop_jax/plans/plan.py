@@ -39,7 +39,8 @@ from walop_jax.plans.exposure_plan import ExposurePlan, PlannedExposure
 from walop_jax.plans.exposures import DRAWS, Candidates, candidates, information_of
 from walop_jax.plans.optimal import GAP, Allocation, Experiment, NotEstimableError
 from walop_jax.science.field_accuracy import known_in_half
-from walop_jax.simulation.observing_plan import ObservingPlan, Stop, polariser_turn
+from walop_jax.simulation.observing_plan import ObservingPlan, Stop
+from walop_jax.simulation.polariser_angles import polariser_turn
 from walop_jax.sky.directions import separation
 
 _NOTHING = 1e-6  # of the prior information: less of it makes no plan
@@ -344,8 +345,15 @@ def _within(
         problem = dataclasses.replace(experiment, families=families, budget=remaining)
         weight = weights.weight[at] * remaining / budget
         scaled = dataclasses.replace(weights, family=family, place=place, weight=weight)
-        integer = optimal.rounded(problem, scaled)
-        integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
+        if required and remaining < min(_cost(problem, {at: 1.0}) for at in scaled.weights):
+            # Those required are all that the time pays for.
+            value = largest_variance(experiment, experiment.known)
+            integer = dataclasses.replace(
+                weights, family=family[:0], place=[], weight=weight[:0], value=value
+            )
+        else:
+            integer = optimal.rounded(problem, scaled)
+            integer = dataclasses.replace(integer, family=np.array(allowed)[integer.family])
         both = _together(integer, required)
         lines = _ordered(found, both.weights)
         between = sum(_changes(found, lines))

@@ -32,6 +32,8 @@ from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import check_names, unknown_name
 from walop_jax.model.specification import effect_context
+from walop_jax.simulation.polariser_angles import USUAL_ANGLES, angles_of
+from walop_jax.simulation.polariser_angles import polariser_turn as polariser_turn
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction
 
 NAN = float("nan")
@@ -51,42 +53,6 @@ _MOON_ROTATOR, _STAR_ROTATOR = (0.0, 40.0, 90.0, 135.0), (0.0, 30.0, 75.0, 120.0
 
 NO_SKY: Mapping[str, Any] = {"moon_patches": 0, "standards": 0, "unpolarised": 0, "throughput_degree": 0}
 """Of a plan on a bench."""
-
-
-def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, ...]:
-    """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one.
-
-    Light behind the polariser is the same half a turn later: of a full turn an odd `count` has so many directions, an
-    even one half as many, each twice.
-    """
-    return tuple(float(a) for a in np.arange(count) * ((360.0 if full_turn else 180.0) / count))
-
-
-_USUAL_ANGLES = polariser_turn()
-
-
-def _angles_of(given: Any, full_turn: Any) -> tuple[float, ...]:
-    """The angles (deg) of the polariser that a plan, in Python or as a file, gives: a list, or the number of them.
-
-    Raises ValueError for what is neither, and for `full_turn` beside a list.
-    """
-    if not isinstance(full_turn, bool | None):
-        raise ValueError(f"full_turn = {full_turn!r} must be true or false")
-    if given is _USUAL_ANGLES and full_turn is not None:
-        given = len(_USUAL_ANGLES)
-    if isinstance(given, int | np.integer) and not isinstance(given, bool):
-        if given < 1:
-            raise ValueError(f"polariser_angles = {given} must be at least 1, or a list of angles (deg)")
-        return polariser_turn(int(given), full_turn=bool(full_turn))
-    listed = np.ndim(given) == 1
-    if listed and full_turn is not None:
-        what = "is of no use beside a list of angles; give their number, or leave it out"
-        raise ValueError(f"full_turn {what}")
-    angles = np.asarray(given, float) if listed else np.array(np.nan)
-    if not np.isfinite(angles).all():
-        what = "must be a number of angles, such as 15, or a list of them (deg)"
-        raise ValueError(f"polariser_angles = {given!r} {what}")
-    return tuple(given) if isinstance(given, tuple) else tuple(angles.tolist())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +138,7 @@ class ObservingPlan:
     grid: int = 12
     field: float = NAN
     standard_grid: int = 5
-    polariser_angles: Sequence[float] | Float[np.ndarray, " a"] | int = _USUAL_ANGLES
+    polariser_angles: Sequence[float] | Float[np.ndarray, " a"] | int = USUAL_ANGLES
     moon_patches: int = 8
     separations: tuple[float, float] = (8.0, 20.0)
     standards: int = 8
@@ -210,7 +176,7 @@ class ObservingPlan:
         return f"ObservingPlan({', '.join([repr(self.name), *text])})"
 
     def __post_init__(self, full_turn: bool | None) -> None:
-        object.__setattr__(self, "polariser_angles", _angles_of(self.polariser_angles, full_turn))
+        object.__setattr__(self, "polariser_angles", angles_of(self.polariser_angles, full_turn))
         if isinstance(self.instrument, str):
             described(self.instrument)  # an unknown name is an error here
         if np.isnan(self.field):
@@ -241,7 +207,7 @@ class ObservingPlan:
         if self.design.polariser is not None:
             if not self.polariser_angles:
                 raise ValueError("at least one polariser angle is needed")
-        elif self.polariser_angles != _USUAL_ANGLES:
+        elif self.polariser_angles != USUAL_ANGLES:
             raise ValueError(f"polariser_angles: {self.name} has no polariser")
         elif not (self.lamps or self.stops or self.moon_patches or self.standards):
             raise ValueError("no exposures: give lamps, Moon patches or standards")
@@ -540,9 +506,9 @@ def plan_of(
     content = dict(content)
     hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
     check_names("entry of a plan", content, hints)
-    angles, full_turn = content.get("polariser_angles", _USUAL_ANGLES), content.pop("full_turn", None)
+    angles, full_turn = content.get("polariser_angles", USUAL_ANGLES), content.pop("full_turn", None)
     if full_turn is not None or not isinstance(angles, list | tuple):
-        content["polariser_angles"] = list(_angles_of(angles, full_turn))
+        content["polariser_angles"] = list(angles_of(angles, full_turn))
     hints["polariser_angles"] = tuple[float, ...]
     named = instrument_named(content, folder)
     content.pop("instrument", None)
