@@ -176,7 +176,9 @@ def alone(name: str) -> Instrument:
 
 
 def test_every_effect_is_one_of_these():
-    assert sorted(GROUP) == sorted(kind.name for kind in EFFECTS)
+    known = {kind.name for kind in EFFECTS}
+    assert known - {*GROUP} == set(), f"add {sorted(known - {*GROUP})} to a group in {__file__}"
+    assert {*GROUP} - known == set(), f"no effect has these names: take them out in {__file__}"
     assert set(DETECTORS) == {*UNDONE, *LEFT_BEHIND}
 
 

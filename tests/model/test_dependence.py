@@ -161,9 +161,12 @@ GROUPS = {
 
 
 def test_every_effect_is_in_a_group():
-    assert sorted(name for group in GROUPS.values() for name in group) == sorted(
-        kind.name for kind in (*EFFECTS, FreeForm)
+    known, listed = (
+        {kind.name for kind in (*EFFECTS, FreeForm)},
+        {name for group in GROUPS.values() for name in group},
     )
+    assert known - listed == set(), f"add {sorted(known - listed)} to a group of GROUPS in {__file__}"
+    assert listed - known == set(), f"no effect has these names: take them out of GROUPS in {__file__}"
 
 
 @pytest.mark.long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -117,7 +118,28 @@ def test_r_hat_of_displaced_ensembles_is_that_of_the_definition() -> None:
 def test_drift_is_found_out() -> None:
     chains = autoregressive(np.random.default_rng(1), 0.5, 2000)
     chains += np.linspace(0, 3, 2000)[None, :, None, None]
-    assert not assess(chains, ("a", "b")).converged
+    reasons = assess(chains, ("a", "b")).reasons
+    assert any(reason.startswith("R-hat between ensembles is") for reason in reasons)
+
+
+def test_a_chain_whose_memory_grows_is_not_long_enough_however_long_it_is() -> None:
+    """τ = (1 + a)/(1 − a) of a quarter of the chain, of half and of all of it: by hand 3, then more; nothing else is
+    wrong: the ensembles agree, and there are hundreds of τ."""
+    rng = np.random.default_rng(5)
+    quick = autoregressive(rng, 0.5, 2000)
+    slow = autoregressive(rng, 0.9, 6000)
+    verdict = assess(np.concatenate([quick, slow], axis=1), ("a", "b"))
+    assert verdict.steps > 200 * verdict.history[2]
+    assert verdict.rhat.max() < 1.01
+    (reason,) = verdict.reasons
+    first, second, third = map(
+        float, re.fullmatch(r"τ still changes: (\S+) → (\S+) → (\S+)", reason).groups()
+    )
+    assert first == pytest.approx(3.0, abs=1.0)
+    assert first < 0.7 * second < 0.7 * third
+    assert not verdict.converged
+    assert verdict.needed == verdict.steps
+    assert assess(autoregressive(rng, 0.9, 8000), ("a", "b")).converged  # the same length, of one memory
 
 
 def test_a_stuck_coordinate_is_found_out() -> None:

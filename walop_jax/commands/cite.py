@@ -20,6 +20,8 @@ def cite(
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included.
 
+    In Python: a tuple of them, each with `what` it is the source of and the reference.
+
     >>> walop.cite(result)[1].what
     'polariser'
     """

@@ -333,7 +333,7 @@ class Command(Generic[T]):
         call.__signature__ = self.signature  # type: ignore[attr-defined]
         call.command = self  # type: ignore[attr-defined]
         described = [f"{name}: {option.help}" for name, option in self.options.items()]
-        call.__doc__ = "\n\n".join((inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described)))
+        call.__doc__ = python_first(inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described))
         return call
 
     def run(self, job: Job, arguments: Mapping[str, Any]) -> Outcome[T]:
@@ -388,6 +388,24 @@ def _paths_in(given: Any) -> list[PathLike]:
     """The paths that an argument consists of: one, or those in a list; of a run its folder."""
     entries = (getattr(entry, "folder", entry) for entry in several(given))
     return [entry for entry in entries if isinstance(entry, str | os.PathLike)]
+
+
+def python_first(text: str, arguments: str) -> str:
+    """The docstring of a command for `help`: what Python gives and takes, the example, then the command line.
+
+    `text` is the docstring of the body, in which a paragraph `In Python: …` and the example come last; `arguments` are
+    lines about its arguments.
+    """
+    first, _, rest = text.partition("\n\n")
+    paragraphs = rest.split("\n\n") if rest else []
+    python = [part for part in paragraphs if part.startswith(("In Python:", ">>>"))]
+    typed = [part for part in paragraphs if part not in python]
+    typed = [f"On the command line:\n\n{typed[0]}", *typed[1:]] if typed else []
+    said = [part for part in python if not part.startswith(">>>")]
+    examples = [part for part in python if part.startswith(">>>")]
+    return "\n\n".join(
+        (first, *said, f"Arguments:\n{arguments}" if arguments else "", *examples, *typed)
+    ).replace("\n\n\n\n", "\n\n")
 
 
 def command(**options: Any) -> Callable[[Callable[..., Outcome[T]]], Callable[..., T]]:

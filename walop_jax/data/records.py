@@ -237,6 +237,15 @@ class Exposures:
     def __len__(self) -> int:
         return len(self.exposure)
 
+    def __repr__(self) -> str:
+        kinds, counts = np.unique(self.kind, return_counts=True)
+        of_kinds = ", ".join(f"{count} {kind}" for kind, count in zip(kinds, counts, strict=True))
+        dated = self.mjd[np.isfinite(self.mjd)]
+        time = f", MJD {dated.min():.2f} to {dated.max():.2f}" if dated.size else ""
+        moving = ", ".join(prefix for prefix, at in self.positions.items() if at.inside.any())
+        filters = ", ".join(map(str, np.unique(self.filter)))
+        return f"Exposures: {of_kinds or 'none'}; {filters}{time}; in the beam: {moving or 'nothing'}"
+
     def __getitem__(self, rows: slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " e"]) -> Exposures:
         return Exposures(
             **{name: values[rows] for name, values in self._plain().items()},
@@ -312,6 +321,12 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.point)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Points: none"
+        x, y = (f"{name} {v.min():+.3f} to {v.max():+.3f}°" for name, v in (("X", self.x), ("Y", self.y)))
+        return f"Points: {len(self)} field points, {x}, {y}"
 
 
 @dataclasses.dataclass(frozen=True)

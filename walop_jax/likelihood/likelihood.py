@@ -179,6 +179,14 @@ class Likelihood:
     runner: Runner
     model: Model
 
+    def __repr__(self) -> str:
+        names, free = len(self.model.names), len(self.model.free)
+        points, exposures = self.layout.points, len(self.calset.exposures)
+        return (
+            f"Likelihood of {self.model.name}: {points} points, {exposures} exposures, {self.calset.cameras} cameras; "
+            f"{names} parameters, {free} free"
+        )
+
     @classmethod
     def of(
         cls,

@@ -37,7 +37,6 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.model.effects import effect_by_name
 from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import places
@@ -52,11 +51,6 @@ from walop_jax.science.watch_readings import Answers, Readings
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 MOST_GROUPS = 150  # exposure groups that are separated; neighbours of more are joined
-RIVALS = (
-    "hwp1_axis", "hwp2_axis", "hwp1_crossing", "hwp2_crossing", "chwp_axis", "wollaston_axis", "upstream_retarder",
-    "telescope_polarisation", "filter_shift",
-)  # fmt: skip
-"""Effects of the optics that may have changed, beside the parameters of the model."""
 EDGES = (2.0, 8.0)  # sharpness of spots: a blurred one and one with an edge
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
 _MOST_CHANGES = 4
@@ -109,12 +103,13 @@ def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[C
 
 
 def with_rivals(calibration: Calibration) -> Calibration:
-    """The calibration with the `RIVALS` that its instrument may have, as columns: at neutral, as good as certain."""
+    """The calibration with the effects that are `watched` and that its instrument may have, as columns of its
+    covariance: at neutral, as good as certain."""
     context = effect_context(calibration.model.template, calibration.exposures)
     model = calibration.model
-    for name in RIVALS:
+    for kind in (kind for kind in model.catalogue if kind.watched):
         try:
-            model = with_effects(model, [effect_by_name(name).neutral(context)], context)
+            model = with_effects(model, [kind.neutral(context)], context)
         except ValueError:
             continue  # there already, or of an element that the instrument lacks
     old = np.array([model.index(name) for name in calibration.model.names])

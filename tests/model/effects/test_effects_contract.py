@@ -58,7 +58,9 @@ with_parameters = [kind for kind in EFFECTS if not kind.is_structural() and kind
 
 
 def test_catalogue_is_the_contract():
-    assert sorted(kind.name for kind in EFFECTS) == sorted(CONTRACT)
+    known = {kind.name for kind in EFFECTS}
+    assert known - {*CONTRACT} == set(), f"add {sorted(known - {*CONTRACT})} to CONTRACT in {__file__}"
+    assert {*CONTRACT} - known == set(), f"no effect has these names: take them out of CONTRACT in {__file__}"
     assert all(effect_by_name(name).name == name for name in CONTRACT)
 
 

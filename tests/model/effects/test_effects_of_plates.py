@@ -12,6 +12,7 @@ import pytest
 
 from walop_jax.model import light, materials, mueller, plates
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.elements.wave_plate import AirGap, Layer, WavePlate
 from walop_jax.model.planning import plan_for
 from walop_jax.model.plates import Plate
 from walop_jax.model.ray import Conditions, Ray
@@ -165,6 +166,24 @@ def test_etalon_by_hand(name, axis):
     assert ahead(0.0) == pytest.approx([1.0, 0.01 * along, 0.01 * across, 0.0], abs=1e-14)
     oblique = ahead(np.sin(np.pi / 3))  # cos 60° = ½
     assert oblique == pytest.approx([1.0, -0.01 * along, -0.01 * across, 0.0], abs=1e-14)
+
+
+def test_the_air_gap_stands_ahead_of_its_plate():
+    """Unpolarised light gets 2 % of polarisation along the first layer, 10°, and the plate then turns that.
+
+    Behind the plate the gap would leave 2 % along 10°. The layers are not crossed: a plate of one axis commutes with
+    the gap.
+    """
+    layers = (Layer(name="a", thickness=30.0), Layer(name="b", material="mgf2", thickness=20.0, axis=50.0))
+    bare = WavePlate(name="plate", layers=layers, axis=10.0)
+    gap = dataclasses.replace(
+        bare, air_gaps=(AirGap(contrast=0.02, gap=0.31),)
+    )  # 4π · 0.31 / 0.62: a maximum
+    ray = Ray.entering(jnp.zeros(()), jnp.zeros(()), (jnp.array([0.62]), Conditions(jnp.zeros(1), {})))
+    plate, whole = (np.asarray(one.mueller(ray))[0] for one in (bare, gap))
+    polarised = np.array([1.0, 0.02 * np.cos(np.deg2rad(20.0)), 0.02 * np.sin(np.deg2rad(20.0)), 0.0])
+    assert np.abs(plate @ polarised - polarised).max() > 0.005
+    np.testing.assert_allclose(whole @ [1.0, 0.0, 0.0, 0.0], plate @ polarised, atol=1e-14)
 
 
 def test_etalon_from_its_linear_directions():

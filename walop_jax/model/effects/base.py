@@ -54,7 +54,8 @@ class Effect(Component):
     amplitudes, without effect at neutral, whatever the shape. `starts` are groups of initial shapes for a
     search: groups are alternatives, the members of a group are directions of a joint fit that `combine` turns
     into one effect. `one_sided` names amplitudes that physics keeps above neutral; `over_field` is true for an
-    effect visible only in several field points; `reference` is its source; `said` are its changes (`change`),
+    effect visible only in several field points, `watched` for one that may change from night to night and that `watch`
+    looks for in stars; `reference` is its source; `said` are its changes (`change`),
     empty for an effect beyond them.
 
     >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
@@ -66,6 +67,7 @@ class Effect(Component):
     starts: ClassVar[tuple[tuple[Mapping[str, Any], ...], ...]] = (({},),)
     one_sided: ClassVar[tuple[str, ...]] = ()
     over_field: ClassVar[bool] = False
+    watched: ClassVar[bool] = False
     revealed_by: ClassVar[str] = ""
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""

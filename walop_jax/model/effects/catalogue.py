@@ -20,7 +20,8 @@ Parameters are the keys that hold a table:
     unit, about, width, scale, loose    as for `parameters.param`
 
 Keys of an entry: about, equation, note, source, revealed_by, separated_by; one_sided (parameters that physics keeps
-above neutral), over_field (true: visible only in several field points), choices ({ camera = "cameras" },
+above neutral), over_field (true: visible only in several field points), watched (true: a change of the optics that
+`watch` looks for in stars), choices ({ camera = "cameras" },
 { source = "stars" }, or a list of words), arrangement (a change of `alternatives`; such an effect has no parameter),
 class (an effect of this package that is not linear in all its numbers), part (of the page of effects, which begins with
 this one).
@@ -51,7 +52,8 @@ from walop_jax.model.parameters import Parameter, check_names
 FILE = "catalogue.toml"
 NEEDED = ("about", "source", "revealed_by", "separated_by")
 KEYS = (
-    "part", *NEEDED, "equation", "symbols", "note", "arrangement", "class", "one_sided", "over_field", "choices",
+    "part", *NEEDED, "equation", "symbols", "note", "arrangement", "class", "one_sided", "over_field", "watched",
+    "choices",
 )  # fmt: skip
 PARAMETER_KEYS = (
     "does", "per_unit", "said", "each", "polar", "turns", "absolute", "neutral", "unit", "about", "width", "scale",
@@ -105,6 +107,7 @@ def _entry(name: str, table: Mapping[str, Any]) -> Entry:
         separated_by=table["separated_by"],
         one_sided=tuple(table.get("one_sided", ())),
         over_field=bool(table.get("over_field", False)),
+        watched=bool(table.get("watched", False)),
         table=table,
     )
 

@@ -71,6 +71,7 @@ class Entry:
     separated_by: str
     one_sided: tuple[str, ...]
     over_field: bool
+    watched: bool = False
     table: Mapping[str, Any] = dataclasses.field(compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -78,6 +79,10 @@ class Entry:
 
     def __hash__(self) -> int:
         return hash(self.name)
+
+    def __repr__(self) -> str:
+        numbers = (f"{n} [{p.unit}]" if p.unit else n for n, p in self.numbers().items())
+        return f"{self.name}({', '.join(numbers)})"
 
     @property
     def polar(self) -> Member | None:

@@ -209,7 +209,7 @@ class WavePlate(Element):
             chosen = [cases[i] for i in members]
             for i, matrix in zip(members, _solved_together(chosen, model), strict=True):
                 plate, ray = cases[i]
-                for gap in plate.air_gaps:  # behind the layers
+                for gap in plate.air_gaps:  # ahead of the layers: light meets it first
                     axis = jnp.deg2rad(_number(plate, "axis", ray) + _number(plate.layers[0], "axis", ray))
                     d = gap.contrast * fringe(gap.gap, ray)
                     matrix = matrix @ mueller.diattenuator(d * jnp.cos(2.0 * axis), d * jnp.sin(2.0 * axis))

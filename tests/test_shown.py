@@ -1,0 +1,53 @@
+"""What a session shows of the things that a user holds: short texts with units, and help that speaks Python first."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+from small_run import SEED, SMALL
+
+import walop_jax as walop
+from walop_jax.commands import COMMANDS
+
+LONGEST = 200  # characters of a line about one thing
+
+
+def test_effects_are_short_and_have_units():
+    shown = [repr(kind) for kind in walop.EFFECTS]
+    assert max(map(len, shown)) < LONGEST
+    assert "hwp1_axis(angle [deg])" in shown
+    assert len(repr(walop.EFFECTS)) < 5000
+
+
+def test_parts_of_a_set_and_its_likelihood_are_lines():
+    calset = walop.simulate(SMALL, seed=SEED).calset
+    assert repr(calset.exposures) == (
+        "Exposures: 8 clp, 3 moon, 3 standard; SDSS-r, MJD 61220.82 to 61220.87; in the beam: CLP"
+    )
+    assert repr(calset.exposures[:0]).startswith("Exposures: none")
+    assert repr(calset.points) == "Points: 29 field points, X -0.290 to +0.290°, Y -0.290 to +0.290°"
+    likelihood = walop.Likelihood.of(calset, walop.base_model(calset))
+    assert repr(likelihood) == (
+        f"Likelihood of WALOP-SOUTH: 29 points, 14 exposures, 4 cameras; {len(likelihood.model.names)} parameters, "
+        f"{len(likelihood.model.free)} free"
+    )
+
+
+@pytest.mark.parametrize("name", [name.replace("-", "_") for name in COMMANDS])
+def test_help_speaks_python_first(name: str):
+    """The sentence, what Python gives, arguments and example; what a terminal adds comes last."""
+    text = inspect.getdoc(getattr(walop, name)) or ""
+    assert text.count("In Python:") == 1
+    second = text.split("\n\n")[1]
+    assert second.startswith("In Python:")
+    if "On the command line:" in text:
+        assert text.index(">>>") < text.index("On the command line:")
+
+
+def test_watched_effects_are_those_that_change_from_night_to_night():
+    """Plates and prisms that are taken out and put back, window, mirror and filter: no crystals, no cameras."""
+    assert sorted(kind.name for kind in walop.EFFECTS if kind.watched) == [
+        "chwp_axis", "filter_shift", "hwp1_axis", "hwp1_crossing", "hwp2_axis", "hwp2_crossing",
+        "telescope_polarisation", "upstream_retarder", "wollaston_axis",
+    ]  # fmt: skip
