@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from small_run import small_fit
 
+from walop_jax.diagnosis import trust
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import corrected_p
 from walop_jax.diagnosis.trust import candidate_scores
+from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS
 
 
@@ -30,3 +32,19 @@ def test_a_fit_and_a_diagnosis_score_alike():
         if score.rank == diagnosed[score.name].rank
     ]
     assert np.max(np.abs(apart)) < 1.0  # a diagnosis allows single exposures a disturbance of their own
+
+
+def test_columns_of_some_points_at_a_time_score_as_all_together(monkeypatch):
+    """29 points in one piece, and in two: the products of their rows add up."""
+    monkeypatch.setattr(limits, "RESPONSES_TOGETHER", 16)
+    design = Design.of(small_fit())
+    assert 16 < len(design.fit.calset.points) < trust.POINTS_TOGETHER
+    together = candidate_scores(design)
+    monkeypatch.setattr(trust, "POINTS_TOGETHER", 16)
+    in_pieces = candidate_scores(design)
+    assert [score.name for score in in_pieces.scores] == [score.name for score in together.scores]
+    assert in_pieces.trials == pytest.approx(together.trials, rel=1e-3)  # draws are in single precision
+    for found, expected in zip(in_pieces.scores, together.scores, strict=True):
+        assert found.rank == expected.rank
+        assert found.statistic == pytest.approx(expected.statistic, rel=1e-7, abs=1e-9)
+        assert found.log_bayes == pytest.approx(expected.log_bayes, rel=1e-7, abs=1e-9)

@@ -141,6 +141,38 @@ def test_a_candidate_that_joins_the_base_is_as_if_it_had_always_been_there(desig
         np.testing.assert_allclose(table[name].amplitudes, direct[name].amplitudes, rtol=1e-7)
 
 
+def test_candidates_that_join_one_after_the_other_join_together(design):
+    """Of what leaves the Gram matrix only factors are kept: entries asked for are those of the whole matrix."""
+    *_, scoring = design
+    one_by_one = scoring.space.with_base(["two"])[0].with_base(["three"])[0]
+    together = scoring.space.with_base(["two", "three"])[0]
+    whole, at, place = (
+        np.asarray(one_by_one.gram),
+        one_by_one.places()["one"],
+        one_by_one.places()["one"].start,
+    )
+    scale = np.diag(np.asarray(scoring.space.gram)).max()
+    np.testing.assert_allclose(whole, together.gram, rtol=0, atol=1e-10 * scale)
+    np.testing.assert_allclose(one_by_one.gram[at, at], whole[at, at], rtol=0, atol=1e-14 * scale)
+    np.testing.assert_allclose(one_by_one.gram[:, place], whole[:, place], rtol=0, atol=1e-14 * scale)
+    chosen = np.ix_(one_by_one.chosen(["one"]), one_by_one.chosen(["three", "one"]))
+    np.testing.assert_allclose(one_by_one.gram[chosen], whole[chosen], rtol=0, atol=1e-14 * scale)
+    np.testing.assert_allclose(one_by_one.gram.diagonal(), np.diag(whole), rtol=0, atol=1e-14 * scale)
+
+
+def test_what_was_taken_out_of_the_columns_comes_back(design):
+    """A basis of parameters that candidates were projected off, and are no longer: G + A Aᵀ."""
+    base, columns, scoring = design
+    every = [columns[name] for name in scoring.space.names]
+    widths = [np.ones(own.shape[1]) for own in every]
+    fewer = Projector(base[:, 1:])
+    lost = fewer(base[:, :1])
+    along = np.hstack(every).T @ (lost / np.linalg.norm(lost))
+    back = scoring.space.with_known(along)
+    free = ScoreSpace.projected(fewer, scoring.space.names, widths, every)
+    np.testing.assert_allclose(np.asarray(back.gram), free.gram, rtol=0, atol=1e-10 * np.abs(free.gram).max())
+
+
 def test_a_nuisance_of_known_width_is_the_covariance_it_adds(design):
     """Columns K with N(0, w²) amplitudes are the same as noise of covariance 1 + w² K Kᵀ."""
     base, columns, scoring = design

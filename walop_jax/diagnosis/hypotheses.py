@@ -174,6 +174,13 @@ def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candi
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
+    return next(candidates_by_points(columns, wanted, max(1, len(columns.likelihood.used))))
+
+
+def candidates_by_points(
+    columns: Columns, wanted: Sequence[Probe], points: int
+) -> Iterator[dict[str, Candidate]]:
+    """The same, for so many points at a time: whole blocks of `limits.RESPONSES_TOGETHER`."""
     likelihood, template = columns.likelihood, columns.likelihood.model.template
     effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
     shown = [*effects, *(p for p in wanted if p.effect is Described)]
@@ -191,17 +198,20 @@ def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candi
     shown = [probe for probe in shown if all(survives[gap] for gap in gaps.get(probe.name, ()))]
     linear = {probe.name: linear[probe.name] for probe in shown if probe.name in linear}
     exact = sum(len(linear.get(probe.name, ())) for probe in effects)
-    blocks = columns.rounded(list(itertools.chain(*linear.values())), exact)
-    used, candidates = [0, 0], {}
-    for probe in shown:
-        if probe.name in linear:
-            single = int(probe.effect is Described)
-            first, used[single] = used[single], used[single] + len(linear[probe.name])
-            block = blocks[single][:, first : used[single]]
-        else:
-            block = own_columns(likelihood, columns.values, probe.group)
-        candidates[probe.name] = Candidate(probe.name, block, probe.widths)
-    return candidates
+    own = {p.name: own_columns(likelihood, columns.values, p.group) for p in shown if p.name not in linear}
+    first = 0
+    for blocks in columns.in_pieces(list(itertools.chain(*linear.values())), exact, points):
+        used, candidates, rows = [0, 0], {}, slice(first, first + len(blocks[0]))
+        for probe in shown:
+            if probe.name in linear:
+                single = int(probe.effect is Described)
+                begin, used[single] = used[single], used[single] + len(linear[probe.name])
+                block = blocks[single][:, begin : used[single]]
+            else:
+                block = own[probe.name][rows]
+            candidates[probe.name] = Candidate(probe.name, block, probe.widths)
+        first += len(blocks[0])
+        yield candidates
 
 
 def sentences_of(probe: Probe) -> tuple[str, ...]:

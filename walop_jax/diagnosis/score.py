@@ -43,6 +43,8 @@ NULL_DRAWS = 1_000
 
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
+Gram = Any
+"""A symmetric matrix whose entries are asked for by index: an array, `Less` or `Blocks`."""
 Reduction = Callable[[Vector, float], tuple[Vector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
@@ -174,7 +176,7 @@ class ScoreSpace:
     sizes: tuple[int, ...]
     widths: Vector
     before: Vector
-    gram: Matrix | Less
+    gram: Gram
     free: int
 
     @classmethod
@@ -210,7 +212,8 @@ class ScoreSpace:
                 rows_of_block = block[rows].T
                 remainder[at, : rows_of_block.shape[1]] += rows_of_block / scale
                 square += remainder[at] @ remainder[at].T
-            add_gram(products, remainder.T, exact)
+            _add_upper(products, remainder.T, exact)
+        _mirror(products)
         for at, square in zip(places, alone, strict=True):
             products[at, at] = square
         return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, products, projector.free)
@@ -344,7 +347,7 @@ class Less:
         self.whole, self.left, self.right = whole, left, right
 
     @classmethod
-    def of(cls, matrix: Matrix | Less, left: Matrix, right: Matrix) -> Less:
+    def of(cls, matrix: Gram, left: Matrix, right: Matrix) -> Less:
         """A matrix less another product L Rᵀ."""
         if not isinstance(matrix, Less):
             return cls(matrix, left, right)
@@ -362,6 +365,23 @@ class Less:
         return self.whole.diagonal() - np.sum(self.left * self.right, axis=1)
 
 
+class Blocks:
+    """A matrix that is 0 but for square blocks along its diagonal, which alone are asked for: `matrix[at, at]`."""
+
+    def __init__(self, blocks: Sequence[Matrix]) -> None:
+        stop = np.cumsum([0, *map(len, blocks)]).tolist()
+        self._blocks = blocks
+        self._by_place = dict(zip(itertools.pairwise(stop), blocks, strict=True))
+
+    def __getitem__(self, index: tuple[slice, slice]) -> Matrix:
+        rows, _ = index
+        return self._by_place[rows.start, rows.stop]
+
+    def diagonal(self) -> Vector:
+        """Entries of the diagonal."""
+        return np.concatenate([block.diagonal() for block in self._blocks])
+
+
 class _Root:
     """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.
 
@@ -370,7 +390,7 @@ class _Root:
     Source: Higham 1990, in Reliable Numerical Computation (Oxford), 161; LAPACK dpstrf.
     """
 
-    def __init__(self, gram: Matrix | Less, alive: Bool[np.ndarray, " _"]) -> None:
+    def __init__(self, gram: Gram, alive: Bool[np.ndarray, " _"]) -> None:
         norm = np.sqrt(np.where(alive, np.clip(gram.diagonal(), 0.0, None), 0.0))
         nonzero = np.flatnonzero(norm)
         self.whole, self.rank = np.zeros((len(norm), 0), np.float32), 0
@@ -454,15 +474,16 @@ def joined_in_batches(columns: Sequence[Matrix]) -> Iterator[tuple[slice, Matrix
         yield slice(int(stop[numbers[0]]), int(stop[numbers[-1] + 1])), joined
 
 
-def gram(columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
-    """CᵀC."""
+def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[np.ndarray, "n n"]:
+    """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
     products = np.zeros((columns.shape[1], columns.shape[1]))
-    add_gram(products, columns)
+    _add_upper(products, columns, exact)
+    _mirror(products)
     return products
 
 
-def add_gram(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int | None = None) -> None:
-    """Add CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
+def _add_upper(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int | None) -> None:
+    """Add CᵀC as in `gram`, piece by piece, to the pieces on and above the diagonal."""
     count = columns.shape[1]
     single = columns if exact is None or exact >= count else columns.astype(np.float32)
     starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
@@ -471,10 +492,16 @@ def add_gram(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int | N
     def product(pair: tuple[slice, slice]) -> None:
         first, second = pair
         source = columns if exact is None or second.stop <= exact else single
-        added = source[:, first].T @ source[:, second]
-        products[first, second] += added
-        if first != second:
-            products[second, first] += added.T
+        products[first, second] += source[:, first].T @ source[:, second]
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(product, itertools.combinations_with_replacement(pieces, 2)))
+
+
+def _mirror(products: Matrix) -> None:
+    """Copy what is above the diagonal to below it."""
+    for first in range(0, len(products), limits.COLUMNS_TOGETHER):
+        at = slice(first, first + limits.COLUMNS_TOGETHER)
+        square = products[at, at]
+        products[at, at] = np.triu(square) + np.triu(square, 1).T
+        products[at.stop :, at] = products[at, at.stop :].T

@@ -36,15 +36,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
-from scipy import linalg, special
+from scipy import special
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
-from walop_jax.diagnosis.hypotheses import Probe, all_candidates
+from walop_jax.diagnosis.hypotheses import Probe, candidates_by_points
 from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
-from walop_jax.diagnosis.score import Projector, ScoreSpace, ScoreTable, effective_trials, local_p
+from walop_jax.diagnosis.score import Blocks, Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
     VarianceComponent,
@@ -69,7 +69,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
-TOGETHER = 1e8  # numbers in the columns of a batch of candidates
+POINTS_TOGETHER = 64  # field points whose columns are made together: 70 MB of 4000 at 16 exposures
 MULTIPLIED = 4e6  # of those that are multiplied together: 32 MB
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
@@ -147,45 +147,67 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     """Scores of all effects and descriptions that a model may lack (`grammar.hypotheses`), with their corrected p.
 
     Only products of the columns of a candidate with each other, the residuals and the projection are needed, so the
-    columns are made in batches; those of `singles` are there already. Their scores in draws of noise give the number of
-    independent trials, as in a diagnosis, so that both correct p alike.
+    columns are made for some points at a time; those of `singles` are there already. Their scores in draws of noise
+    give the number of independent trials, as in a diagnosis, so that both correct p alike.
     """
-    fit, calset, basis, count = design.fit, design.fit.calset, design.projector.basis, design.rows
+    fit, calset, basis = design.fit, design.fit.calset, design.projector.basis
     listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
     probes = listed.beside(fit.model.effect_names)
     numbers = (item.single for item in (singles.items if singles else ()))
-    known = {n.candidate.name: n.candidate.columns[:count] for n in numbers if n.probe}
+    known = {n.candidate.name: n.candidate.columns for n in numbers if n.probe}
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
     normal = design.projector(normal).astype(np.float32)
-    scored, blocks = list[Probe](), []
-    for batch in _in_groups(probes, TOGETHER / len(residual)):
-        made = all_candidates(design.columns, [probe for probe in batch if probe.name not in known])
-        shown = [probe for probe in batch if probe.name in known or probe.name in made]
-        for group in _in_groups(shown, MULTIPLIED / len(residual)):
+    asked, first, sums = [probe for probe in probes if probe.name not in known], 0, dict[str, _Products]()
+    used = design.measured.used
+    for number, made in enumerate(candidates_by_points(design.columns, asked, POINTS_TOGETHER)):
+        points = slice(number * POINTS_TOGETHER, (number + 1) * POINTS_TOGETHER)
+        rows = slice(first, first := first + design.measured.cameras * int(used[points].sum()))
+        shown = [probe for probe in probes if probe.name in known or probe.name in made]
+        for group in _in_groups(shown, MULTIPLIED / max(1, rows.stop - rows.start)):
             columns = [
-                known[p.name] if p.name in known else made[p.name].columns.astype(float) / fit.noise_scale
+                known[p.name][rows]
+                if p.name in known
+                else made[p.name].columns.astype(float) / fit.noise_scale
                 for p in group
             ]
             joined = np.concatenate(columns, axis=1)
-            along, scores = basis[:count].T @ joined, joined.T @ residual[:count]
-            drawn, last = joined.T.astype(np.float32) @ normal[:count], 0
-            for c in columns:
+            along, scores = basis[rows].T @ joined, joined.T @ residual[rows]
+            drawn, last = joined.T.astype(np.float32) @ normal[rows], 0
+            for p, c in zip(group, columns, strict=True):
                 at = slice(last, last := last + c.shape[1])
-                square, part = c.T @ c, along[:, at]
-                blocks.append((np.diag(square), scores[at], drawn[at], square - part.T @ part))
-        scored += shown
+                products = _Products(c.T @ c, along[:, at], scores[at], drawn[at])
+                sums[p.name] = products if p.name not in sums else sums[p.name].plus(products)
+    scored = [probe for probe in probes if probe.name in sums]
     if not scored:
         return ScoreTable((), noise, 1.0, 1.0)
-    before, scores, drawn = (np.concatenate(arrays) for arrays in list(zip(*blocks, strict=True))[:3])
-    names, widths = tuple(probe.name for probe in scored), [probe.widths for probe in scored]
-    gram = np.asarray(linalg.block_diag(*(block for *_, block in blocks)))
+    parts = [sums[probe.name] for probe in scored]
+    gram = Blocks([part.square - part.along.T @ part.along for part in parts])
     space = ScoreSpace(
-        names, tuple(map(len, widths)), np.concatenate(widths), before, gram, design.projector.free
+        names=tuple(probe.name for probe in scored),
+        sizes=tuple(len(probe.widths) for probe in scored),
+        widths=np.concatenate([probe.widths for probe in scored]),
+        before=np.concatenate([np.diag(part.square) for part in parts]),
+        gram=gram,
+        free=design.projector.free,
     )
-    trials = effective_trials(space.smallest_of(drawn))
+    trials = effective_trials(space.smallest_of(np.concatenate([part.drawn for part in parts])))
+    scores = np.concatenate([part.scores for part in parts])
     return space.table_after(ScoreTable((), noise, 1.0, trials), scores)
+
+
+class _Products(NamedTuple):
+    """Products of the columns C of a candidate: CᵀC, those with the basis of the parameters, residuals, draws."""
+
+    square: np.ndarray
+    along: np.ndarray
+    scores: np.ndarray
+    drawn: np.ndarray
+
+    def plus(self, other: _Products) -> _Products:
+        """Those of the rows of both."""
+        return _Products(*(mine + theirs for mine, theirs in zip(self, other, strict=True)))
 
 
 def _in_groups(probes: Sequence[Probe], amplitudes: float) -> Iterator[list[Probe]]:

@@ -15,7 +15,7 @@ Limits      first order. Where detectors are not linear their derivative stands 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -328,22 +328,29 @@ class Columns:
         self, changes: Sequence[Change], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
+        return next(self.in_pieces(changes, exact, max(1, len(self.likelihood.used))))
+
+    def in_pieces(
+        self, changes: Sequence[Change], exact: int, points: int
+    ) -> Iterator[tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]]:
+        """The same for so many points at a time (whole blocks of `limits.RESPONSES_TOGETHER`), one after the other."""
         changed_terms = [self.terms_of(change) for change in changes]
-        likelihood, size = self.likelihood, limits.RESPONSES_TOGETHER
-        used, cameras = likelihood.used, len(self.patched.cameras)
-        length = cameras * int(used.sum())
-        precisions = (
-            (changed_terms[:exact], np.empty((exact, length))),
-            (changed_terms[exact:], np.empty((len(changes) - exact, length), np.float32)),
-        )
-        distinct_slots, first = list(dict.fromkeys(term.slot for terms in changed_terms for term in terms)), 0
-        for start in range(0, len(used), size):
-            rows = cameras * int(used[start : start + size].sum())
-            block = ResponseBlock(self, start, distinct_slots)
-            for terms, columns in precisions:
-                block.fill(terms, columns[:, first : first + rows])
-            first += rows
-        return precisions[0][1].T, precisions[1][1].T
+        used, size = self.likelihood.used, limits.RESPONSES_TOGETHER
+        distinct_slots = list(dict.fromkeys(term.slot for terms in changed_terms for term in terms))
+        for piece in range(0, max(1, len(used)), points):
+            starts = range(piece, min(piece + points, len(used)), size)
+            rows = [len(self.patched.cameras) * int(used[start : start + size].sum()) for start in starts]
+            precisions = (
+                (changed_terms[:exact], np.empty((exact, sum(rows)))),
+                (changed_terms[exact:], np.empty((len(changes) - exact, sum(rows)), np.float32)),
+            )
+            first = 0
+            for start, count in zip(starts, rows, strict=True):
+                block = ResponseBlock(self, start, distinct_slots)
+                for terms, columns in precisions:
+                    block.fill(terms, columns[:, first : first + count])
+                first += count
+            yield precisions[0][1].T, precisions[1][1].T
 
 
 class ResponseBlock:

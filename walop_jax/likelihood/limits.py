@@ -95,7 +95,7 @@ SELDOM_OPTIMISED_ABOVE = 20_000
 """The same for responses, which one likelihood asks for once."""
 FREE_EXPOSURES = 100
 """Exposures of a set up to which a free-form term may have a number for each camera in each of them."""
-PRODUCT_ROWS = 1024
+PRODUCT_ROWS = 2048
 """Rows of columns that are projected and multiplied together: a copy of them is small beside all."""
 COLUMNS_TOGETHER = 256
 """Columns that are multiplied together: large enough for the full speed of a core, small enough to share them out."""
