@@ -437,7 +437,6 @@ def write(tmp_path, **columns):
         ({"N_ERR": np.array([[1.0, 1, 1, 1], [1, 0, 1, 1]])}, "N_ERR: is not above 0 in row 1"),
         ({"ROTATOR": [0.0, np.nan], "ID": [5, 5]}, "ROTATOR: is missing in row 1"),
         ({"N_FLAG": [0.5, 0.0]}, "N_FLAG: is neither one integer"),
-        ({"X": [0.0, np.nan]}, "X: is not finite in row 1"),
     ],
 )
 def test_bad_catalogues(tmp_path, columns, message):
