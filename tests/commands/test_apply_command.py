@@ -10,6 +10,7 @@ import pytest
 from astropy.table import Table
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_product
 from walop_jax.data.settings import Settings
 
@@ -92,8 +93,7 @@ def test_the_summary_says_how_well_p_is_known_and_variances_are_noticed(call, ru
 @pytest.fixture(scope="module")
 def sound(run, tmp_path_factory):
     """Forty stars as the calibration has them, with the noise of photons."""
-    rng, calibration = np.random.default_rng(1), read_product(run / "calibration.fits")
-    vectors = AnalysisVectors(calibration)
+    rng, vectors = np.random.default_rng(1), AnalysisVectors(Calibration.read(run / "calibration.fits"))
     x, y = rng.uniform(-0.2, 0.2, (2, 40))
     expected = 1e6 * vectors.coloured(Settings.default(1), x, y)[..., 0]
     counts = rng.normal(expected, np.sqrt(expected))

@@ -12,7 +12,7 @@ Symbols     c  the question: shift of (q, u) of an unpolarised star by a unit ch
                (`Estimate.gain`), of the balance of an arm: first camera brighter by half of it, second fainter by half
             B  interstellar polarisation of the field: means of q and u of each exposure group, polynomials of X and Y
             A  errors of the calibration and of unknown colours, θ ~ N(0, 1); finer interstellar structure, cosines of
-               variance a k⁻ᵝ with k half waves over the field, a as large as the marginal likelihood allows
+               variance a k⁻ᵝ with k half waves over the field, a and β of the marginal likelihood
             own  scatter of the stars' own polarisation, of variance τ² in q and in u, such that χ² is its degrees of
                freedom (Paule & Mandel 1982, J. Res. NBS 87, 377)
 Size        γ = c̃ᵀ W y / c̃ᵀ W c, W the inverse of noise + τ², c̃ what B and A leave of c
@@ -47,12 +47,12 @@ _ROUNDS = 5
 _EFFECTIVE = 6.0  # stars that the information on a question is worth at least
 _REGULAR = 1e-12  # determinant over squared trace of the information on q and u of a star
 _SMALL_SHARE = 1e-6  # of its information that a question must have behind B and A
-_STARS_OF_DEGREE = (0, 30, 100)
-"""Stars from which interstellar polarisation is a constant, a polynomial of degree 1, 2 in X and Y, …"""
+_STARS_OF_DEGREE = (0, 30, 100, 300)
+"""Stars from which interstellar polarisation is a constant, a polynomial of degree 1, 2, 3 in X and Y, …"""
 _STARS_OF_WAVE = 4  # … stars for each of the cosines of the finer structure, …
 _MOST_WAVES = 10  # … which has so many half waves at most, …
 _SURELY = 4.0  # of −2 ln L, two standard deviations
-_SLOPE = 2.5  # … and the exponent β of its variance
+_SLOPES = (1.5, 2.5, 3.5, 4.5)  # … and the exponents β of its variance that are tried
 _MOST_GROUPS = 20  # exposure groups with a mean of their own
 
 OfStars = Float[np.ndarray, " s"]
@@ -246,8 +246,8 @@ def _of_both(scalar: Float[np.ndarray, "s m"]) -> Float[np.ndarray, "s 2 n"]:
 
 def _interstellar(
     light: OwnLight, x: OfStars, y: OfStars
-) -> tuple[Float[np.ndarray, "s 2 b"], Float[np.ndarray, "s 2 w"]]:
-    """Interstellar polarisation: B, and cosines of finer structure, each with its standard deviation for a = 1."""
+) -> tuple[Float[np.ndarray, "s 2 b"], Float[np.ndarray, "s 2 w"], Float[np.ndarray, " w"]]:
+    """Interstellar polarisation: B, and cosines of finer structure with their numbers k of half waves."""
     count = len(x)
     degree = int(np.searchsorted(_STARS_OF_DEGREE, count, side="right")) - 1
     powers = [(i, n - i) for n in range(1, degree + 1) for i in range(n + 1)]
@@ -259,34 +259,35 @@ def _interstellar(
     waves = sorted((np.hypot(i, j), i, j) for i, j in numbers if 0 < np.hypot(i, j) <= _MOST_WAVES)
     waves = waves[: count // _STARS_OF_WAVE]
     half = 0.5 * np.pi
-    cosines = [
-        k ** (-0.5 * _SLOPE) * np.cos(half * i * (x + 1)) * np.cos(half * j * (y + 1)) for k, i, j in waves
-    ]
-    return _of_both(np.column_stack([means, *terms])), _of_both(
-        np.column_stack([np.zeros((count, 0)), *cosines])
+    cosines = [np.cos(half * i * (x + 1)) * np.cos(half * j * (y + 1)) for _, i, j in waves]
+    fine = _of_both(np.column_stack([np.zeros((count, 0)), *cosines]))
+    return (
+        _of_both(np.column_stack([means, *terms])),
+        fine,
+        np.repeat([k for k, *_ in waves], 2).astype(float),
     )
 
 
 def _fitted(light: OwnLight) -> _Fitted | None:
     """The stars behind B and A, far ones left out; None if too few are left."""
     edge = max(float(np.abs([light.x, light.y]).max()), 1e-9)
-    smooth, fine = _interstellar(light, light.x / edge, light.y / edge)
+    smooth, fine, halves = _interstellar(light, light.x / edge, light.y / edge)
     flat, waves = smooth.shape[-1], fine.shape[-1]
     asked = np.concatenate([smooth, light.nuisances, light.questions, fine], axis=-1)
     first = asked.shape[-1] - waves
     prior = np.zeros(first)
     prior[flat : first - light.questions.shape[-1]] = 1.0
     square = np.einsum("sij->s", light.qu[:, :, None] ** 2)
-    scatter, used, amplitude = 0.5 * float(np.median(square)), np.ones(len(light.qu), bool), 0.0
+    scatter, used, width = 0.5 * float(np.median(square)), np.ones(len(light.qu), bool), np.zeros(waves)
     for _ in range(_ROUNDS):
         if 2 * used.sum() - flat < FEWEST:
             return None
         white = np.linalg.inv(np.linalg.cholesky(light.noise + scatter * np.eye(2))) * used[:, None, None]
         full = (white @ asked).reshape(-1, asked.shape[-1])
         matrix, pull = full.T @ full, full.T @ (white @ light.qu[..., None]).reshape(-1)
-        amplitude, taken = _amplitude(matrix, pull, prior)
+        width, taken = _widths(matrix, pull, prior, halves)
         complete = np.concatenate([prior, np.ones(waves)])
-        scale = np.concatenate([np.ones(first), np.full(waves, np.sqrt(amplitude))])
+        scale = np.concatenate([np.ones(first), width])
         root = whitening(matrix * scale * scale[:, None] + np.diag(complete), 1e-12)
         left = light.qu - asked @ (scale * (root @ (root.T @ (scale * pull))))
         chi2 = np.sum((white @ left[..., None]) ** 2, axis=(1, 2))
@@ -298,7 +299,7 @@ def _fitted(light: OwnLight) -> _Fitted | None:
         chi2 = np.einsum("si,sij,sj->s", left, variance, left)
         used = chi2 < FAR * max(float(np.median(chi2)) / float(special.chdtri(2, 0.5)), 1.0)
     white = np.linalg.inv(np.linalg.cholesky(light.noise + scatter * np.eye(2))) * used[:, None, None]
-    base = np.concatenate([smooth, light.nuisances, fine * np.sqrt(amplitude)], axis=-1)
+    base = np.concatenate([smooth, light.nuisances, fine * width], axis=-1)
     columns = white @ base
     full = columns.reshape(-1, base.shape[-1])
     prior = np.ones(base.shape[-1])
@@ -309,25 +310,39 @@ def _fitted(light: OwnLight) -> _Fitted | None:
     return _Fitted(used, qu, left, white @ light.questions, columns, root, scatter, dof)  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
-def _amplitude(
-    matrix: Float[np.ndarray, "m m"], pull: Float[np.ndarray, " m"], prior: Float[np.ndarray, " f"]
-) -> tuple[float, float]:
-    """The largest a that the marginal likelihood allows, all columns ahead of the cosines fitted; numbers taken.
+def _widths(
+    matrix: Float[np.ndarray, "m m"],
+    pull: Float[np.ndarray, " m"],
+    prior: Float[np.ndarray, " f"],
+    halves: Float[np.ndarray, " w"],
+) -> tuple[Float[np.ndarray, " w"], float]:
+    """Standard deviations of the cosines, all columns ahead of them fitted, and how many numbers they take.
 
-    Allowed is −2 ln L up to `_SURELY` above its minimum: faint stars hardly know a, and too small a one is an alarm.
-    With Λ, t the eigenvalues of the matrix of the cosines and their pulls, −2 ln L = Σ ln(1 + aΛ) − Σ a t²/(1 + aΛ).
+    The largest a, of the likeliest β, for which −2 ln L is no more than `_SURELY` above its minimum: faint stars hardly
+    know a, and too small a one is an alarm. With Λ, t the eigenvalues of the matrix of the cosines of a = 1 and their
+    pulls, −2 ln L = Σ ln(1 + aΛ) − Σ a t²/(1 + aΛ).
     """
     first = len(prior)
     if first == len(matrix):
-        return 0.0, 0.0
+        return np.zeros(0), 0.0
     root = whitening(matrix[:first, :first] + np.diag(prior), 1e-12)
     cross = matrix[first:, :first] @ root
-    values, axes = np.linalg.eigh(matrix[first:, first:] - cross @ cross.T)
-    values, t = np.maximum(values, 0.0), axes.T @ (pull[first:] - cross @ (root.T @ pull[:first]))
-    tried = np.append(0.0, np.geomspace(1e-9, 1.0, 91))[:, None]
-    misfit = np.sum(np.log1p(tried * values) - tried * t**2 / (1.0 + tried * values), axis=1)
-    best = float(tried[misfit < misfit.min() + _SURELY, 0].max())
-    return best, float(np.sum(best * values / (1.0 + best * values)))
+    remaining, score = (
+        matrix[first:, first:] - cross @ cross.T,
+        pull[first:] - cross @ (root.T @ pull[:first]),
+    )
+    tried, found = np.append(0.0, np.geomspace(1e-9, 1.0, 91)), []
+    for slope in _SLOPES:
+        scale = halves ** (-0.5 * slope)
+        values, axes = np.linalg.eigh(remaining * scale * scale[:, None])
+        values, t = np.maximum(values, 0.0), axes.T @ (scale * score)
+        power = tried[:, None] * values
+        misfit = np.sum(np.log1p(power) - tried[:, None] * t**2 / (1.0 + power), axis=1)
+        best = int(np.flatnonzero(misfit < misfit.min() + _SURELY).max())
+        taken = float(np.sum(power[best] / (1.0 + power[best])))
+        found.append((float(misfit.min()), np.sqrt(tried[best]) * scale, taken))
+    _, width, taken = min(found, key=lambda entry: entry[0])
+    return width, taken
 
 
 def _scatter(left: Float[np.ndarray, "s 2"], noise: Float[np.ndarray, "s 2 2"], dof: float) -> float:
