@@ -273,14 +273,12 @@ class ObservingPlan:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         degree = self.design.throughput.degree if self.throughput_degree is None else self.throughput_degree
         fields |= {"instrument": self.name, "throughput_degree": degree, "moving": dict(self.moving)}
-        fields["stated_errors"] = dict(self.stated_errors)
         if any(isinstance(entry, FilterCurve) for entry in self.filters):
             fields["filters"] = {_name_of(entry): _curve_document(entry) for entry in self.filters}
         # Named only where there are any: plans of other instruments read as they always did.
         fields["stops"] = [stop.document() for stop in self.stops]
         later = {"moving": {}, "lamps": 0, "stops": [], "patches": None, "stars": None, "star_lmax": ()}
-        later |= {"stated_errors": {}}
-        later |= {"spacing": type(self).spacing}
+        later |= {"spacing": type(self).spacing, "stated_errors": {}}
         later |= {name: getattr(type(self), name) for name in fields if name.startswith("zero_")}
         return {key: value for key, value in fields.items() if key not in later or value != later[key]}
 
