@@ -26,7 +26,6 @@ from small_run import SEED, SMALL
 from typer.main import get_command
 
 import walop_jax as walop
-from walop_jax.commands import command as commands
 from walop_jax.commands.docs import pages
 from walop_jax.commands.program import app
 
@@ -174,13 +173,7 @@ def test_the_effect_page(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_command_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its command with the rows of its options: it counts, and writes its document."""
-    page = TEXTS["adding-a-command"]
-    rows = next(block for block in blocks(page) if block.startswith("count,output"))
-    table = Path(commands.__file__).with_name("options.csv").read_text(encoding="utf-8")
-    (tmp_path / "options.csv").write_text(table + rows, encoding="utf-8")
-    monkeypatch.setattr(commands, "__file__", str(tmp_path / "command.py"))  # the table stands beside it
-    commands.options_of_commands.cache_clear()
+    """Its command, from its file alone: it has its options, counts, and writes its document."""
     (tmp_path / "count.py").write_text(PYTHON["adding-a-command"][0], encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     count = importlib.import_module("count").count
@@ -190,7 +183,8 @@ def test_the_command_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = float(np.median(used))
     assert count(calset, output=tmp_path / "RUN", least=limit) == int((used >= limit).sum())
     assert (tmp_path / "RUN" / "count.json").exists()
-    commands.options_of_commands.cache_clear()
+    assert list(count.command.options) == ["data", "output", "least"]
+    assert "least: Fewest electrons that count." in count.__doc__
 
 
 def test_the_year(capsys: pytest.CaptureFixture):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.apply import calibration_for, stars_of
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, Product
 from walop_jax.commands.tables import named_tables
 from walop_jax.io.errors import errors_naming
@@ -15,7 +16,27 @@ if TYPE_CHECKING:
     from walop_jax.science.affected import Affected
 
 
-@command(stages=("reading", "tabulating"), writes=(AFFECTED,))
+OPTIONS = {
+    "old": Option(
+        "Calibration that the catalogues were reduced with, or its run.",
+        metavar="OLD",
+        kind=Path,
+        placed=True,
+    ),
+    "new": Option("Calibration that takes its place.", metavar="NEW", kind=Path, placed=True),
+    "catalogues": Option(
+        "Catalogues, as apply reads or writes them.", metavar="CATALOGUE...", kind=list[Path], placed=True
+    ),
+    "output": Option("Folder for affected.json.", metavar="RUN", kind=Path, short="-o"),
+    "limit": Option(
+        "Shift (standard errors) from which a result is made again (default: 0.5).",
+        metavar="SIGMA",
+        kind=float,
+    ),
+}
+
+
+@command(stages=("reading", "tabulating"), writes=(AFFECTED,), options=OPTIONS)
 def affected(
     job: Job,
     old: Product,

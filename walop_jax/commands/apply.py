@@ -10,7 +10,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, command_of, several, typed
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    UsageError,
+    command,
+    command_of,
+    several,
+    typed,
+)
 from walop_jax.commands.gather import gather
 from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
@@ -24,7 +34,39 @@ if TYPE_CHECKING:
     from walop_jax.science.catalogue import Catalogue
 
 
-@command(stages=("reading", "tabulating", "writing"), writes=())
+OPTIONS = {
+    "calibration": Option(
+        "Calibration product, or the folder of a run.", metavar="RUN/calibration.fits", kind=Path, placed=True
+    ),
+    "catalogue": Option(
+        "Table with X, Y, N, N_ERR (in CSV N0, … N0_ERR, … or O1, … O1_ERR, …), or those of the cameras, "
+        "as for gather.",
+        metavar="CATALOGUE...",
+        kind=list[Path],
+        placed=True,
+    ),
+    "output": Option(
+        "Table to write (.fits, .csv, .ecsv).", metavar="OUT", kind=Path, short="-o", required=True
+    ),
+    "debias": Option(
+        "Estimator of P_DEBIASED: Plaszczynski et al. 2014, or Wardle and Kronberg 1974.", metavar="MAS|WK"
+    ),
+    "saturation": Option("Counts from here on are not used (FLAG 256).", metavar="ELECTRONS", kind=float),
+    "force": Option("Also stars whose filter or temperature it does not cover (FLAG 2048)."),
+    "common": Option(
+        "Write the common table of stellar polarisation (Panopoulou et al. 2025), also Galactic q, u."
+    ),
+    "each": Option("Each CATALOGUE by itself: OUT is a folder of tables with their names."),
+    "workers": Option(
+        "With --each: in so many processes of this machine, by Dask.", metavar="N", kind=int, least=1
+    ),
+    "scheduler": Option(
+        "With --each: on the workers of a Dask cluster that share the files.", metavar="ADDRESS", kind=str
+    ),
+}
+
+
+@command(stages=("reading", "tabulating", "writing"), writes=(), options=OPTIONS)
 def apply(
     job: Job,
     calibration: Product,

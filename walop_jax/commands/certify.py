@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, after_fit, command
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, after_fit, command
 from walop_jax.commands.products import Effects, Product, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import DataError, errors_naming
 from walop_jax.io.names import COMMISSIONING, IN_MEMORY, PRODUCT
@@ -15,7 +15,17 @@ if TYPE_CHECKING:
     from walop_jax.science.commissioning import Certificate
 
 
-@command(writes=(COMMISSIONING,))
+OPTIONS = {
+    "calibration": Option(
+        "Calibration product, or the folder of a run.", metavar="RUN/calibration.fits", kind=Path, placed=True
+    ),
+    "output": Option(
+        "Folder for commissioning.json; it may be that of the fit.", metavar="RUN", kind=Path, short="-o"
+    ),
+}
+
+
+@command(writes=(COMMISSIONING,), options=OPTIONS)
 def certify(
     job: Job, calibration: Product, effects: Effects = None, *, output: PathLike | None = None
 ) -> Outcome[Certificate]:

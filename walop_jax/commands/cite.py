@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, command
+from walop_jax.commands.command import Job, Option, Outcome, command
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.io.names import POSTERIOR
 
@@ -14,7 +14,15 @@ if TYPE_CHECKING:
     from walop_jax.model.references import Reference
 
 
-@command()
+OPTIONS = {
+    "run": Option(
+        "Run, or its calibration.fits; default: the base model.", metavar="[RUN]", kind=Path, placed=True
+    ),
+    "bibtex": Option("As BibTeX entries."),
+}
+
+
+@command(options=OPTIONS)
 def cite(
     job: Job, run: Product | None = None, *, bibtex: bool = False, effects: Effects = None
 ) -> Outcome[tuple[Reference, ...]]:

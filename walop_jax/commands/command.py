@@ -2,17 +2,14 @@
 
 The body of a command takes a `Job` and its own arguments, and returns an `Outcome`. The decorator makes two faces of
 it: the Python function, which takes `overwrite`, `progress` and `seed` beside those arguments and returns the value;
-and the command of the program, whose options are the parameters with a row in `options.csv` (`program.py`).
+and the command of the program, whose options are the parameters with an `Option` (`program.py`).
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
 import inspect
-import io
-import json
 import logging
 import os
 import re
@@ -64,21 +61,48 @@ class Option:
         return (self.metavar or name.upper()).strip("[]") if self.placed else f"--{name.replace('_', '-')}"
 
 
-KINDS: Mapping[str, Any] = {
-    "path": Path, "paths": list[Path], "text": str, "texts": list[str], "number": float, "integer": int, "": None,
-}  # fmt: skip
-
-
-@functools.cache
-def options_of_commands() -> Mapping[str, Mapping[str, Option]]:
-    """The options of each command by name, of `options.csv`; those of `*` are of all commands with such a parameter."""
-    text = Path(__file__).with_name("options.csv").read_text(encoding="utf-8")
-    options: dict[str, dict[str, Option]] = {"*": {}}
-    for row in csv.DictReader(io.StringIO(text)):
-        about = row["HELP"], row["METAVAR"] or None, KINDS[row["KIND"]], row["SHORT"], bool(row["NEED"])
-        option = Option(*about, json.loads(row["LEAST"] or "null"), bool(row["FORM"]))
-        options.setdefault(row["COMMAND"], {})[row["NAME"]] = option
-    return options
+SHARED: Mapping[str, Option] = {
+    "data": Option(
+        "Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path], placed=True
+    ),
+    "model": Option(
+        "Model file: parameters free, tied, held; effects added.", metavar="MODEL.toml", kind=Path
+    ),
+    "instrument": Option(
+        "An instrument that comes with the package, or a description file; see walop-jax instrument.",
+        metavar="NAME|FILE.toml",
+        kind=str,
+    ),
+    "effects": Option(
+        "Effects of your own beside those of the catalogue; see walop-jax docs adding-an-effect.",
+        metavar="FILE.toml|.py",
+        kind=Path,
+    ),
+    "goal": Option(
+        "Error of p of a star that is wanted, in per cent (default: 0.1).",
+        metavar="PERCENT",
+        kind=float,
+        least=0.0,
+    ),
+    "posterior": Option(
+        "Use draws of walop-jax sample, not the covariance.", metavar="posterior.nc", kind=Path
+    ),
+    "elements": Option(
+        "Kinds of elements of your own; see walop-jax docs adding-an-instrument.",
+        metavar="FILE.py",
+        kind=Path,
+    ),
+    "overwrite": Option("Replace outputs that exist."),
+    "seed": Option("Seed of random numbers (default: 0).", least=0),
+    "quiet": Option("Print nothing but warnings and errors.", short="-q"),
+    "json": Option("Machine-readable result to stdout, nothing else."),
+    "at": Option(
+        "Angle (deg) of a moving element in the beam, named like its columns: CHWP=45. May be repeated.",
+        metavar="P=ANGLE",
+        kind=list[str],
+    ),
+}
+"""Options of all commands with such a parameter, unless they have one of that name themselves."""
 
 
 class UsageError(ValueError):
@@ -256,7 +280,8 @@ class Command(Generic[T]):
     matters. `jax`: it computes. `outputs` are the arguments that name what is written. `elements`: it takes kinds of
     elements of one's own, as commands with `effects` do.
     `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
-    share. `options` are those of its own arguments by name, `described` all in `options.csv` that it might have.
+    share. `options` are those of its own arguments by name; beside those that are given it has those of `SHARED`.
+    `described` are all that it might have.
     """
 
     body: Callable[..., Outcome[T]]
@@ -266,6 +291,7 @@ class Command(Generic[T]):
     jax: bool = True
     elements: bool = False
     outputs: Sequence[str] = ("output",)
+    options: Mapping[str, Option] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.name = self.body.__name__
@@ -281,8 +307,7 @@ class Command(Generic[T]):
         make = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
         added = [make(name, default=default, annotation=kind) for name, (default, kind) in shared.items()]
         self.signature = inspect.Signature([*own, *(p for p in added if not absent.get(p.name))])
-        options = options_of_commands()
-        self.described = {**options["*"], **options.get(self.name, {})}
+        self.described = {**SHARED, **self.options}
         names = (name for name in self.signature.parameters if name not in COMMON)
         self.options = {name: self.described[name] for name in names if name in self.described}
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.inputs import ModelLike, Sets, set_and_model, set_of
 from walop_jax.commands.products import Effects, InstrumentLike, Product
 from walop_jax.io.errors import fail
@@ -18,7 +19,19 @@ TABLE = "comparison.fits"
 FIGURES = {f"comparison_{name}.png": f"{name}_figure" for name in ("histogram", "map", "offset", "spectral")}
 
 
-@command(stages=("reading", "fitting", "judging"), writes=(COMPARISON, TABLE, *FIGURES), random=True)
+OPTIONS = {
+    "output": Option("Folder of the results.", metavar="RUN", kind=Path, short="-o", required=True),
+    "truth": Option("True X, Y, M21 … M33 (FITS, CSV), for simulated sets.", metavar="TABLE", kind=Path),
+    "filter": Option("Filter to compare in.", metavar="NAME"),
+}
+
+
+@command(
+    stages=("reading", "fitting", "judging"),
+    writes=(COMPARISON, TABLE, *FIGURES),
+    random=True,
+    options=OPTIONS,
+)
 def compare(
     job: Job,
     data: Sets,

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, command_of, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, command_of, typed
 from walop_jax.commands.refit import STAGES, refit
 from walop_jax.io.errors import fail
 
@@ -18,7 +18,12 @@ SET, PLAN, SEED = "walop_south_small.fits", "walop_south_small_plan.toml", 2026
 STARS, CORRECTED, COUNT = "stars.fits", "stars_corrected.fits", 200
 
 
-@command(stages=STAGES, writes=())
+OPTIONS = {
+    "output": Option("Folder to write.", metavar="FOLDER", kind=Path, short="-o"),
+}
+
+
+@command(stages=STAGES, writes=(), options=OPTIONS)
 def demo(job: Job, *, output: PathLike = "walop-jax-demo") -> Outcome[FitResult]:
     """Fit the small calibration set that comes with the package, write its page, and correct stars.
 

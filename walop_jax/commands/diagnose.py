@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, after_fit, command
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, after_fit, command
 from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.folder import output_folder
@@ -21,7 +21,28 @@ if TYPE_CHECKING:
 OUTPUTS = (PRODUCT, SUMMARY, DIAGNOSIS, FIGURE_DATA, MODEL)
 
 
-@command(stages=("reading", "fitting", "scoring", "naming", "mapping"), writes=OUTPUTS, random=True)
+OPTIONS = {
+    "output": Option("Folder of the results.", metavar="RUN", kind=Path, short="-o"),
+    "minutes": Option(
+        "Minutes after which no further name is looked for (default: none; the search ends by itself).",
+        metavar="MINUTES",
+        kind=float,
+        least=0.0,
+    ),
+    "why": Option(
+        "Answer why an effect, or a description, was not named by a diagnosis that has been made; give its RUN.",
+        metavar="NAME",
+        kind=str,
+    ),
+}
+
+
+@command(
+    stages=("reading", "fitting", "scoring", "naming", "mapping"),
+    writes=OUTPUTS,
+    random=True,
+    options=OPTIONS,
+)
 def diagnose(
     job: Job,
     data: Sets,

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from walop_jax.commands.command import Job, Outcome, UsageError, command
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.io.errors import nearest
 
+OPTIONS = {
+    "topic": Option("Page to print; without it, the list.", metavar="[TOPIC]", kind=str, placed=True),
+}
 
-@command(jax=False)
+
+@command(jax=False, options=OPTIONS)
 def docs(job: Job, topic: str | None = None) -> Outcome[str]:
     """Print a reference page, or the list of pages.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import Sets, set_of
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of
 from walop_jax.io.errors import errors_naming
@@ -15,7 +16,18 @@ if TYPE_CHECKING:
     from walop_jax.science.epoch import Epoch
 
 
-@command(stages=("reading", "fitting", "lacking"), writes=(PRODUCT, EPOCH), random=True)
+OPTIONS = {
+    "old": Option("Old calibration product, or folder of a run.", metavar="OLD", kind=Path, placed=True),
+    "new": Option(
+        "Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path], placed=True
+    ),
+    "output": Option(
+        "Folder for the new calibration and the comparison.", metavar="RUN", kind=Path, short="-o"
+    ),
+}
+
+
+@command(stages=("reading", "fitting", "lacking"), writes=(PRODUCT, EPOCH), random=True, options=OPTIONS)
 def epoch(
     job: Job, old: Product, new: Sets, *, output: PathLike | None = None, effects: Effects = None
 ) -> Outcome[Epoch]:

@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, several
+
+OPTIONS = {
+    "files": Option(
+        "FITS files, a JSON export of a log, a table of words or a schedule.",
+        metavar="FILE...",
+        kind=list[Path],
+        placed=True,
+    ),
+    "words": Option(
+        "Which word is which column, which numbers are filters.",
+        metavar="WORDS.toml",
+        kind=Path,
+        required=True,
+    ),
+    "output": Option(
+        "Table to write (.fits, .csv, .ecsv).", metavar="OUT", kind=Path, short="-o", required=True
+    ),
+}
 
 
-@command(writes="table", jax=False)
+@command(writes="table", jax=False, options=OPTIONS)
 def exposures(
     job: Job,
     files: PathLike | Sequence[PathLike],

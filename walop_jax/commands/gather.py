@@ -8,14 +8,56 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, several, typed
 from walop_jax.commands.products import InstrumentLike, design_of
 
 if TYPE_CHECKING:
     from walop_jax import Instrument
 
 
-@command(stages=("reading", "matching", "writing"), writes="table", jax=False)
+OPTIONS = {
+    "catalogues": Option(
+        "Catalogues of the cameras, in their order: O1 E1 O2 E2.",
+        metavar="CATALOGUE...",
+        kind=list[Path],
+        placed=True,
+    ),
+    "output": Option(
+        "Table to write (.fits, .csv, .ecsv).", metavar="OUT", kind=Path, short="-o", required=True
+    ),
+    "columns": Option(
+        "Names of the columns of another program than SExtractor and photutils.",
+        metavar="FILE.toml",
+        kind=Path,
+    ),
+    "ra": Option(
+        "Right ascension of the field centre (deg); without it that of the header, or of the WCS.", kind=float
+    ),
+    "dec": Option(
+        "Declination of the field centre (deg); without it that of the header, or of the WCS.", kind=float
+    ),
+    "rotator": Option(
+        "Position angle of +X (deg); without it that of the header, or of the axis x of the WCS.", kind=float
+    ),
+    "tolerance": Option("Stars farther apart than that are not one (arcsec).", metavar="ARCSEC", least=0.01),
+    "gain": Option("Electrons per count, where fluxes are in counts.", kind=float),
+    "gaia": Option(
+        "Table with RA, DEC, SOURCE_ID, BP_RP, PHOT_G_MEAN_MAG, PMRA, PMDEC, REF_EPOCH: who the stars are.",
+        metavar="TABLE",
+        kind=Path,
+    ),
+    "words": Option(
+        "Words of the header that are FILTER, MJD, CHWP_ANGLE, RA, …, as for exposures.",
+        metavar="WORDS.toml",
+        kind=Path,
+    ),
+    "drop_blends": Option(
+        "Leave out, in each camera, stars that are flagged as having a neighbour or as deblended."
+    ),
+}
+
+
+@command(stages=("reading", "matching", "writing"), writes="table", jax=False, options=OPTIONS)
 def gather(
     job: Job,
     catalogues: Sequence[PathLike],

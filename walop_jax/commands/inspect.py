@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, command, typed
+from walop_jax.commands.command import Job, Option, Outcome, command, typed
 from walop_jax.commands.inputs import Sets, paths_of
 
 if TYPE_CHECKING:
     from walop_jax.data.inspection import InspectedSets
 
 
-@command(jax=False)
+OPTIONS = {
+    "data": Option("Calibration sets (FITS).", metavar="CALSET...", kind=list[Path], placed=True),
+}
+
+
+@command(jax=False, options=OPTIONS)
 def inspect(job: Job, data: Sets) -> Outcome[InspectedSets]:
     """List the contents and the faults of calibration sets.
 

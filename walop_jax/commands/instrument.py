@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Listing, Option, Outcome, PathLike, UsageError, command
 from walop_jax.io.errors import errors_naming
 
+OPTIONS = {
+    "source": Option(
+        "A shipped instrument or a description file; none: list them.",
+        metavar="[NAME|FILE.toml]",
+        kind=str,
+        placed=True,
+    ),
+    "text": Option("Print the description itself, to start one's own from."),
+}
 
-@command(jax=False, elements=True)
+
+@command(jax=False, elements=True, options=OPTIONS)
 def instrument(job: Job, source: PathLike | None = None, *, text: bool = False) -> Outcome[Any]:
     """Print and check an instrument: its elements, cameras and parameters, from its description file.
 

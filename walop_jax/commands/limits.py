@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
 from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, fit_of
 from walop_jax.io.names import LIMITS, PRODUCT
@@ -20,10 +20,27 @@ if TYPE_CHECKING:
 PROTECTION, SEPARATION = "limits_protection.png", "limits_separation.png"
 
 
+OPTIONS = {
+    "data": Option(
+        "Calibration sets (FITS), fitted as one, or an observing plan in place of them.",
+        metavar="CALSET...|PLAN.toml",
+        kind=list[Path],
+        placed=True,
+    ),
+    "output": Option(
+        "Folder for limits.json and its two figures; it may be that of a fit of the same sets.",
+        metavar="RUN",
+        kind=Path,
+        short="-o",
+    ),
+}
+
+
 @command(
     stages=("reading", "fitting", "differentiating", "comparing", "unnoticed"),
     writes=(LIMITS, PROTECTION, SEPARATION),
     random=True,
+    options=OPTIONS,
 )
 def limits(
     job: Job,

@@ -7,12 +7,26 @@ from pathlib import Path
 from typing import Any
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, typed
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.errors import errors_naming, fail, nearest
 
+OPTIONS = {
+    "calibration": Option(
+        "Calibration product, or the folder of a run.", metavar="RUN/calibration.fits", kind=Path, placed=True
+    ),
+    "x": Option("One field point: X (deg).", kind=float),
+    "y": Option("The same: Y (deg).", kind=float),
+    "points": Option("FITS, CSV, ECSV or VOTable with X, Y in degrees.", metavar="TABLE", kind=Path),
+    "output": Option(
+        "Table to write (.fits, .csv, .ecsv); needed with --points.", metavar="OUT", kind=Path, short="-o"
+    ),
+    "teff": Option("Colour temperature (K); without it, a flat spectrum.", kind=float),
+    "filter": Option("Filter of the calibration, or SDSS-r.", kind=str),
+}
 
-@command(writes="table")
+
+@command(writes="table", options=OPTIONS)
 def matrix(
     job: Job,
     calibration: products.Product,

@@ -6,7 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, given, several, typed, write_text
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    command,
+    given,
+    several,
+    typed,
+    write_text,
+)
 from walop_jax.commands.inputs import set_of
 from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, design_of
 
@@ -15,7 +25,19 @@ if TYPE_CHECKING:
     from walop_jax.fit.base_model import ModelFile
 
 
-@command(writes="file")
+OPTIONS = {
+    "calsets": Option(
+        "Calibration sets that the model is for: standards, gauges.",
+        metavar="[CALSET...]",
+        kind=list[Path],
+        placed=True,
+    ),
+    "output": Option("File to write; default: stdout.", metavar="MODEL.toml", kind=Path, short="-o"),
+    "effect": Option("Add an effect; may be repeated.", metavar="NAME", kind=list[str]),
+}
+
+
+@command(writes="file", options=OPTIONS)
 def model(
     job: Job,
     calsets: CalibrationSet | PathLike | Sequence[PathLike] | None = None,

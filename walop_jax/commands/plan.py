@@ -9,7 +9,17 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, several, typed, write_text
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    UsageError,
+    command,
+    several,
+    typed,
+    write_text,
+)
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, is_product
 from walop_jax.io.atomic import check_output
 from walop_jax.io.names import PLANNED
@@ -23,11 +33,63 @@ if TYPE_CHECKING:
 PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 
 
+OPTIONS = {
+    "available": Option(
+        "Candidate exposures: a plan file, an instrument by name, or the RUN to add to.",
+        metavar="PLAN.toml|INSTRUMENT|RUN",
+        kind=Path,
+        placed=True,
+    ),
+    "minutes": Option(
+        "Time for exposures, read-out, pointing and changes, in minutes.",
+        metavar="MINUTES",
+        kind=float,
+        least=0.0,
+    ),
+    "candidates": Option("Candidate exposures of a RUN or an instrument.", metavar="PLAN.toml", kind=Path),
+    "criterion": Option(
+        "Quantity to be known best: worst (default: the largest error of p over field and colour), mean, "
+        "a parameter, a table of stars (X, Y in degrees, Q, U), or apart: effects that --apart names, or "
+        "those that a diagnosis of RUN could not separate.",
+        metavar="NAME|TABLE",
+        kind=str,
+    ),
+    "goal": Option(
+        "A value of the criterion, in % for errors of p: print the time that it takes.",
+        metavar="VALUE",
+        kind=float,
+    ),
+    "after": Option("A calibration that is there already: plan what to add to it.", metavar="RUN", kind=Path),
+    "apart": Option(
+        "Effect to be separated from the others, NAME=VALUE as for simulate, or NAME alone for one that "
+        "is a rival only. Give it twice or more.",
+        metavar="NAME=VALUE",
+        kind=list[str],
+    ),
+    "draws": Option("Instruments, drawn from the priors, that the plan is made for.", kind=int, least=1),
+    "schedule": Option(
+        "Write the exposures as a schedule of the survey (format v4).", metavar="FILE.json", kind=Path
+    ),
+    "words": Option(
+        "Numbers of filters and facts of a schedule; see walop-jax docs files.",
+        metavar="WORDS.toml",
+        kind=Path,
+    ),
+    "output": Option(
+        "Folder for plan.toml and plan.json; without it the plan is printed only.",
+        metavar="RUN",
+        kind=Path,
+        short="-o",
+    ),
+}
+
+
 @command(
     stages=("information", "searching"),
     writes=(PLAN, INSTRUMENT, PLANNED),
     random=True,
     outputs=("output", "schedule"),
+    options=OPTIONS,
 )
 def plan(
     job: Job,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Listing, Outcome, PathLike, UsageError, command
+from walop_jax.commands.command import Job, Listing, Option, Outcome, PathLike, UsageError, command
 from walop_jax.commands.products import Effects, catalogue_of
 from walop_jax.io.atomic import check_output
 from walop_jax.io.errors import fail
@@ -26,7 +26,28 @@ def check_picture(path: PathLike, *, overwrite: bool) -> None:
     check_output(path, overwrite=overwrite)
 
 
-@command(writes=())
+OPTIONS = {
+    "run": Option("Folder of results; none: list the figures.", metavar="[RUN]", kind=Path, placed=True),
+    "name": Option("The figure.", metavar="[NAME]", kind=str, placed=True),
+    "output": Option(
+        "File to write: .pdf, .png, .svg (default: NAME.png).", metavar="FILE", kind=Path, short="-o"
+    ),
+    "parameters": Option("Coefficients of a corner or trace plot, by name.", metavar="A,B,…", kind=str),
+    "x": Option("Field point of transmission and modulation, X (deg).", kind=float),
+    "y": Option("The same, Y (deg).", kind=float),
+    "step": Option("Effect of a diagnosis (effect, signature); 0: starting and final model.", least=0),
+    "width": Option(
+        "Width in print, with type of 7 pt: column (89 mm), page (183 mm), or in mm.",
+        metavar="column|page|MM",
+        kind=str,
+    ),
+    "data": Option(
+        "Calibration set of the fit, if it has moved; again for each.", metavar="CALSET", kind=list[Path]
+    ),
+}
+
+
+@command(writes=(), options=OPTIONS)
 def plot(
     job: Job,
     run: Drawable | PathLike | None = None,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, several
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, several
 from walop_jax.commands.plot import check_picture
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.io.atomic import check_output
@@ -22,7 +22,23 @@ SHOWN = {
 """Columns that are printed, with the factor and the unit in which they are."""
 
 
-@command(stages=("reading", "writing"), outputs=("output", "figure"))
+OPTIONS = {
+    "runs": Option(
+        "Runs or calibrations, one for each night.", metavar="RUN...", kind=list[Path], placed=True
+    ),
+    "output": Option(
+        "Table that the nights are added to (.ecsv, .csv, .fits).",
+        metavar="QUALITY.ecsv",
+        kind=Path,
+        short="-o",
+        required=True,
+    ),
+    "limits": Option("Limits in place of those of the package.", metavar="LIMITS.toml", kind=Path),
+    "figure": Option("Draw all nights of the table: .png, .pdf, .svg.", metavar="FILE", kind=Path),
+}
+
+
+@command(stages=("reading", "writing"), outputs=("output", "figure"), options=OPTIONS)
 def quality(
     job: Job,
     runs: Product | Sequence[Product],

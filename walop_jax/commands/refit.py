@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import (
     Job,
+    Option,
     Outcome,
     PathLike,
     after_fit,
@@ -28,7 +30,28 @@ if TYPE_CHECKING:
 STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands that fit and do more
 
 
-@command(stages=STAGES, writes=(PRODUCT, SUMMARY, CLIPPED), random=True, outputs=("output", "compress"))
+OPTIONS = {
+    "output": Option("Folder of the results.", metavar="RUN", kind=Path, short="-o", required=True),
+    "memory": Option("Memory for the data, in GB.", metavar="GB", kind=float, least=0.1),
+    "clip": Option(
+        "Leave out single intensities so many standard errors off; 5 is usual.",
+        metavar="SIGMA",
+        kind=float,
+        least=3.0,
+    ),
+    "compress": Option(
+        "Write whole frames as a small set with the same information.", metavar="SET.fits", kind=Path
+    ),
+}
+
+
+@command(
+    stages=STAGES,
+    writes=(PRODUCT, SUMMARY, CLIPPED),
+    random=True,
+    outputs=("output", "compress"),
+    options=OPTIONS,
+)
 def refit(
     job: Job,
     data: Sets,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, write_text
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, write_text
 from walop_jax.commands.inputs import goal_of, save
 from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
 from walop_jax.io.atomic import check_output
@@ -19,7 +19,16 @@ if TYPE_CHECKING:
 PAGE = "report.html"
 
 
-@command(stages=("reading", "drawing"), writes=())
+OPTIONS = {
+    "run": Option("Folder of results, of whichever command.", metavar="RUN", kind=Path, placed=True),
+    "output": Option("Page to write (default: RUN/report.html).", metavar="FILE", kind=Path, short="-o"),
+    "data": Option(
+        "Calibration set of the fit, if it has moved; again for each.", metavar="CALSET", kind=list[Path]
+    ),
+}
+
+
+@command(stages=("reading", "drawing"), writes=(), options=OPTIONS)
 def report(
     job: Job,
     run: Fit,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, command, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import ModelLike
 from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
@@ -26,7 +27,22 @@ OUTPUTS = (
 )  # fmt: skip
 
 
-@command(writes=(), random=True)
+OPTIONS = {
+    "fit": Option("Folder of a `walop-jax refit`.", metavar="RUN", kind=Path, placed=True),
+    "resume": Option("Go on from the chain in RUN/sampling (emcee)."),
+    "data": Option(
+        "Calibration set of the fit, if it has moved; again for each.", metavar="CALSET", kind=list[Path]
+    ),
+    "sampler": Option("emcee, nuts, or your own as FILE.py:CLASS.", metavar="NAME", kind=str),
+    "inflate": Option("Sample a factor on the errors of the data."),
+    "maximum_steps": Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1),
+    "walkers": Option("Walkers of an emcee ensemble; 0: at least 64.", least=0),
+    "interval": Option("Steps after which convergence is judged and the chain kept.", least=1),
+    "moves": Option("Moves of emcee: laplace, de or stretch."),
+}
+
+
+@command(writes=(), random=True, options=OPTIONS)
 def sample(
     job: Job,
     fit: Fit,

@@ -7,7 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, PathLike, UsageError, command, given, typed, write_text
+from walop_jax.commands.command import (
+    Job,
+    Option,
+    Outcome,
+    PathLike,
+    UsageError,
+    command,
+    given,
+    typed,
+    write_text,
+)
 from walop_jax.commands.products import (
     Effects,
     InstrumentLike,
@@ -27,7 +37,46 @@ if TYPE_CHECKING:
     from walop_jax.simulation.truth import Template
 
 
-@command(stages=("following", "writing"), writes=(), random=True, outputs=("output", "truth"))
+OPTIONS = {
+    "plan": Option(
+        "Observing plan (TOML); default: the usual one of the instrument.",
+        metavar="[PLAN.toml]",
+        kind=Path,
+        placed=True,
+    ),
+    "output": Option(
+        "Calibration set to write (FITS).", metavar="SET.fits", kind=Path, short="-o", required=True
+    ),
+    "effect": Option(
+        "Effect to hide in the data; NAME=par:value,par:value for several parameters (a/b/c/d for one "
+        "value per element), NAME alone where there is none to give. May be repeated.",
+        metavar="NAME=VALUE",
+        kind=list[str],
+    ),
+    "like": Option(
+        "Another night of the same instrument: a run as fitted, or the truth of a simulated set. "
+        "Instrument and catalogue are those; --effect changes the instrument, --seed draws weather and "
+        "noise.",
+        metavar="RUN|TRUTH.json",
+        kind=Path,
+    ),
+    "night": Option("Number of the night: days after the date of the plan.", metavar="N", kind=int, least=0),
+    "truth": Option("Write the true parameters here.", metavar="FILE.json", kind=Path),
+    "stars": Option(
+        "Make a catalogue of so many stars in place of the set: of the same instrument.",
+        metavar="N",
+        kind=int,
+        least=1,
+    ),
+    "cameras": Option(
+        "With --stars: catalogues of the cameras as well, as SExtractor writes them (STARS_O1.fits, …), for gather."
+    ),
+}
+
+
+@command(
+    stages=("following", "writing"), writes=(), random=True, outputs=("output", "truth"), options=OPTIONS
+)
 def simulate(
     job: Job,
     plan: ObservingPlan | PathLike | None = None,

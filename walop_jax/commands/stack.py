@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from walop_jax.commands.command import Job, Outcome, UsageError, after_fit, command, several
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, after_fit, command, several
 from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of
 from walop_jax.io.names import CLIPPED, NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 
@@ -15,7 +15,29 @@ if TYPE_CHECKING:
     from walop_jax.nights.survey import Survey
 
 
-@command(stages=("reading", "stacking"), writes=(NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY))
+OPTIONS = {
+    "nights": Option(
+        "Calibration sets, folders of refit, or a SURVEY.", metavar="NIGHT...", kind=list[Path], placed=True
+    ),
+    "laws": Option(
+        "Model file with [law] tables (default: that of the first fit).", metavar="MODEL.toml", kind=Path
+    ),
+    "like": Option(
+        "Fit with the model of all nights (default: the first RUN or SURVEY given).", metavar="RUN", kind=Path
+    ),
+    "events": Option("Table of works on the instrument: MJD, WHAT.", metavar="TABLE", kind=Path),
+    "no_breaks": Option("Do not look for breaks."),
+    "workers": Option(
+        "Make nights in so many processes of this machine, by Dask.", metavar="N", kind=int, least=1
+    ),
+    "scheduler": Option(
+        "Make nights on the workers of a Dask cluster that share the files.", metavar="ADDRESS", kind=str
+    ),
+    "output": Option("Folder of the survey.", metavar="SURVEY", kind=Path, short="-o", required=True),
+}
+
+
+@command(stages=("reading", "stacking"), writes=(NIGHTS, REFERENCE, PRODUCT, TRACKS, SURVEY), options=OPTIONS)
 def stack(
     job: Job,
     nights: Any,

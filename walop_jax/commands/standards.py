@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from walop_jax.commands.command import Job, Outcome, UsageError, command
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.commands.products import InstrumentLike
 
+OPTIONS = {
+    "near": Option(
+        "Sorted by the distance from a direction (deg); one number for each.", metavar="RA,DEC", kind=str
+    ),
+    "up": Option(
+        "Those above 30° at a time (UTC) at the site of the instrument, the highest first.",
+        metavar="MJD",
+        kind=float,
+    ),
+}
 
-@command(jax=False)
+
+@command(jax=False, options=OPTIONS)
 def standards(
     job: Job,
     *,

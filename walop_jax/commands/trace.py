@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.commands import products
-from walop_jax.commands.command import Job, Outcome, UsageError, command
+from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
 from walop_jax.commands.products import Angles, Effects, InstrumentLike, Product, design_of
 
 if TYPE_CHECKING:
@@ -14,7 +15,24 @@ if TYPE_CHECKING:
     from walop_jax.model.trace import Traced
 
 
-@command()
+OPTIONS = {
+    "calibration": Option(
+        "An instrument as fitted; without it, as designed.",
+        metavar="[RUN/calibration.fits]",
+        kind=Path,
+        placed=True,
+    ),
+    "x": Option("Field position X (deg)."),
+    "y": Option("Field position Y (deg)."),
+    "q": Option("Stokes q of the source, a fraction."),
+    "u": Option("Stokes u of the source, a fraction."),
+    "angle": Option("Polariser in, with its axis here (deg).", kind=float),
+    "teff": Option("Colour temperature (K); without it, a flat spectrum.", kind=float),
+    "filter": Option("Filter of the calibration, or SDSS-r.", kind=str),
+}
+
+
+@command(options=OPTIONS)
 def trace(
     job: Job,
     calibration: Product | Instrument | None = None,

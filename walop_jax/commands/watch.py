@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.apply import stars_of
-from walop_jax.commands.command import Job, Outcome, PathLike, command, figure_file, typed
+from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.products import Effects, Product, calibration_of
 from walop_jax.commands.tables import named_tables
 from walop_jax.io.errors import errors_naming
@@ -17,7 +18,24 @@ if TYPE_CHECKING:
 TABLE, FIGURE = "watch.fits", "watch.png"
 
 
-@command(stages=("reading", "tabulating", "watching"), writes=(WATCHED, TABLE, FIGURE))
+OPTIONS = {
+    "calibration": Option(
+        "Calibration product, or the folder of a run.", metavar="RUN/calibration.fits", kind=Path, placed=True
+    ),
+    "catalogues": Option(
+        "FITS, CSV or ECSV with X, Y, N, N_ERR, and MJD.",
+        metavar="CATALOGUE...",
+        kind=list[Path],
+        placed=True,
+    ),
+    "output": Option(
+        "Folder for watch.json, watch.fits and watch.png.", metavar="RUN", kind=Path, short="-o"
+    ),
+    "force": Option("Also stars whose filter or temperature the calibration does not cover."),
+}
+
+
+@command(stages=("reading", "tabulating", "watching"), writes=(WATCHED, TABLE, FIGURE), options=OPTIONS)
 def watch(
     job: Job,
     calibration: Product,
