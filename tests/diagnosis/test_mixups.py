@@ -14,7 +14,8 @@ from small_run import SEED, SMALL
 
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet, Position
-from walop_jax.diagnosis.readings import _angles, mixups
+from walop_jax.diagnosis.discrete import causes
+from walop_jax.diagnosis.readings import _angles
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult
@@ -153,7 +154,7 @@ def test_angles_are_rewritten_as_the_remedy_says(calset):
 def test_every_mix_up_is_told_with_its_remedy(request, name):
     spoil, said = CASES[name]
     bad = spoil(request.getfixturevalue("calset" if name in OF_THE_PLATE else "without_plate"))
-    found = mixups(bad, base_model(bad), left=1e5)
+    found = causes(bad, base_model(bad), left=1e5)
     # A plate at a single angle does not tell another sense from another zero.
     assert len(found) == (2 if name in TWO else 1)
     assert any(re.search(said, str(one)) for one in found)
@@ -172,7 +173,7 @@ def test_the_other_sign_of_u_is_told():
         (single, f"U of {sources.name[star]} in SOURCES had the other sign"),
     ):
         bad = with_standards(calset, u=sign * sources.u)
-        best = mixups(bad, base_model(bad), left=1e5)[0]
+        best = causes(bad, base_model(bad), left=1e5)[0]
         assert best.what == what
         assert best.explained < 1.5
 
@@ -188,7 +189,7 @@ def test_a_camera_with_one_number_everywhere_is_refused(without_plate):
 @pytest.mark.long
 def test_a_polariser_that_was_not_in_the_beam_is_told():
     bad = unpolarised(simulate(SMALL, seed=SEED))
-    (found,) = mixups(bad, base_model(bad), left=1e5)
+    (found,) = causes(bad, base_model(bad), left=1e5)
     assert found.what == "the calibration polariser was not in the beam"
     assert found.explained < 1.5
 
@@ -204,11 +205,11 @@ def test_a_fit_of_mixed_up_data_is_refused(calset):
 def test_right_data_and_effects_are_no_mix_up(calset):
     """However large: an encoder error of 2°, and half the light of a camera."""
     model = base_model(calset)
-    assert mixups(calset, model, left=1.0) == ()
+    assert causes(calset, model, left=1.0) == ()
     wobble = 2.0 * np.sin(np.deg2rad(calset.exposures.clp_angle))
-    assert mixups(with_angle(calset, calset.exposures.clp_angle + wobble), model, left=5e3) == ()
+    assert causes(with_angle(calset, calset.exposures.clp_angle + wobble), model, left=5e3) == ()
     counts = block_of(calset).counts * np.array([1.0, 0.5, 1.0, 1.0])
-    assert mixups(with_block(calset, counts=counts), model, left=1e3) == ()
+    assert causes(with_block(calset, counts=counts), model, left=1e3) == ()
 
 
 @pytest.mark.long

@@ -19,6 +19,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import hidden_errors
 from walop_jax.calibration.matrix import first_setting, matrix_slopes
 from walop_jax.data.records import CalibrationSet
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import stated_conditions as conditions
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
@@ -149,6 +150,22 @@ def test_a_share_of_the_sky_that_is_left_is_told_with_its_size():
     assert examined(sound).trusted
 
 
+def test_a_sky_that_was_made_of_the_counts_is_told_as_that_and_asks_for_nothing():
+    """A tenth of N holds the noise of N: the residuals vanish, and all numbers have errors 1000 times too small."""
+    fitted = refit(simulate(SMALL, seed=SEED).calset)
+    table = fitted.calset.intensities
+    assert isinstance(table, TableIntensities)
+    calset = dataclasses.replace(
+        fitted.calset, intensities=dataclasses.replace(table, sky=table.counts / 10.0)
+    )
+    copied = fit(Likelihood.of(calset, fitted.model), start=fitted.values)
+    singles = Singles.of(Design.of(copied))
+    assert [name for name in singles.of_noise if "light of the sky" in name] == list(singles.of_noise)
+    assert len(singles.of_noise) == 1
+    assert list(stated_conditions(Design.of(copied), singles)) == []
+    assert singles.noise_scale > 0.8
+
+
 @pytest.mark.long
 def test_sky_left_over_in_twenty_sets_and_in_no_sound_one():
     """1 % of the level in each, told ahead of all else with its size."""
@@ -236,9 +253,10 @@ def an_hour_late(calset: CalibrationSet) -> CalibrationSet:
 def test_one_number_explains_data_in_which_no_name_was_found(change, what, size):
     calset = change(simulate(SMALL, seed=SEED).calset)
     wrong = refit(calset)
-    text = instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong)
+    text, explained = instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong)
     found = re.search(what, text)
     assert found, text
+    assert explained  # it is what happened: nothing but noise is left
     assert float(found[1].replace("−", "-")) == pytest.approx(size, rel=0.1)
 
 
@@ -247,7 +265,7 @@ def test_where_no_number_explains_the_data_none_is_told():
         simulate(SMALL, seed=5, effects=[effect_from_text("camera_leakage=0.02", SMALL.context())]).calset
     )
     assert not wrong.explains_data
-    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, wrong) == ("", False)
 
 
 def test_a_number_that_would_be_impossible_is_no_rival():
@@ -256,7 +274,7 @@ def test_a_number_that_would_be_impossible_is_no_rival():
     wrong = refit(simulate(SMALL, seed=SEED, effects=[wobble]).calset)
     neutral = wobble.kind.neutral(SMALL.context())
     right = refit(wrong.calset, with_effects(wrong.model, [neutral], SMALL.context()))
-    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, right) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, right) == ("", False)
 
 
 def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
@@ -268,7 +286,7 @@ def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
     assert wrong.noise_scale > 2.0
     assert named.noise_scale == 1.0
     monkeypatch.setattr(thresholds, "ALARM", np.inf)
-    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, named) == ""
+    assert instead_of_names(condition_scores(Design.of(wrong)), wrong, named) == ("", False)
 
 
 def test_scale_and_angle_are_sums_of_both_coordinates():

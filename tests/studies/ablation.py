@@ -141,8 +141,8 @@ RULES = (
          lambda args, answer: sum(len(step.groups) for step in args[1].steps) > thresholds.MOST_SENTENCES,
          ((remainder, "concluded"), (workflow, "concluded"))),
     Rule("one number that the set states, instead of names (`instead_of_names`)",
-         ((remainder, "instead_of_names"),), always(""), answers),
-    Rule("another reading of the data is asked (`mixups_of`)", ((workflow, "mixups_of"),), always(()), answers),
+         ((remainder, "instead_of_names"),), always(("", False)), answers),
+    Rule("another reading of the data is asked (`causes_of`)", ((workflow, "causes_of"),), always(()), answers),
 )  # fmt: skip
 OF_LINEAR_STEPS = RULES[:6]
 INSTEAD = remainder.instead_of_names
@@ -267,7 +267,7 @@ def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
 
 MOST_KEPT = 3  # examinations beside the first: each has the columns of all candidates
 SLOW: tuple[Place, ...] = (
-    (workflow, "fit"), (workflow, "mixups_of"), (refits, "examine"), (refits, "fit"), (refits, "try_effect"),
+    (workflow, "fit"), (workflow, "causes_of"), (refits, "examine"), (refits, "fit"), (refits, "try_effect"),
     (exact, "try_effect"), (refits, "other_descriptions"), (refits, "refit_without"), (refits, "before_and_after"),
     (remainder, "try_effect"), (remainder, "evidence_of_presence"), (remainder, "held_out"), (refits, "held_out"),
     (Refits, "_hopeful"),

@@ -56,9 +56,10 @@ def diagnose(
 ) -> Outcome[Diagnosis]:
     """Find the effects that the model lacks, add them, and fit again: RUN/diagnosis.json and RUN/calibration.fits.
 
-    The verdict is consistent, effect_found or unexplained. Effects that the data cannot separate are listed
-    together; effects that the data cannot show at all are listed as such. RUN/calibration.fits and RUN/summary.json
-    are of the extended model, and RUN/model.toml is that model, for `refit --model` and `compare --model`;
+    The verdict is consistent, effect_found, unexplained, or wrong_number: a number that the set states explains all.
+    Effects that the data cannot separate are listed together; effects that the data cannot show at all are listed as
+    such. RUN/calibration.fits and RUN/summary.json are of the extended model, and RUN/model.toml is that model, for
+    `refit --model` and `compare --model`;
     `walop-jax report` draws its figures from RUN/diagnosis.fits. Exit code 3 where that calibration is not to be
     trusted, whatever was found.
 
@@ -96,7 +97,7 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     from walop_jax.science.field_accuracy import answered
 
     product, after = found.calibration(), answered(found.after)
-    complete = found.verdict != "unexplained"
+    complete = found.complete
     usable, shown = after.trusted and complete, found.display()
     if after.answer is not None and after.converged and (accuracy := after.answer()) is not None:
         shown = dataclasses.replace(shown, facts=(*shown.facts, *accuracy.facts(complete=complete)))

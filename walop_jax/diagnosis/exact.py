@@ -135,16 +135,19 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
     return log_bayes(information - np.diag(width**-2.0), scores, width, scales)
 
 
-def try_effect(base: FitResult, instance: Effect, prior_shapes: int = 1) -> Trial:
+def try_effect(
+    base: FitResult, instance: Effect, prior_shapes: int = 1, *, start: Vector | None = None
+) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again.
 
-    Sentences join those that the model has. It shares the prior of one name with all of its `prior_shapes`.
+    Sentences join those that the model has. It shares the prior of one name with all of its `prior_shapes`. The other
+    parameters start at their fitted values, or at `start`: a model that is far off has bent them.
     """
     if isinstance(instance, Described):
         model = with_sentences(base.model, instance, base.calset)
     else:
         model = with_effects(base.model, [instance], base.calset)
-    return _try_model(base, instance.kind, model, base.values, prior_shapes)
+    return _try_model(base, instance.kind, model, base.values if start is None else start, prior_shapes)
 
 
 def _try_model(

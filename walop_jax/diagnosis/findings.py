@@ -139,7 +139,7 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-Outcome = Literal["consistent", "effect_found", "unexplained"]
+Outcome = Literal["consistent", "effect_found", "wrong_number", "unexplained"]
 Cube = Float[np.ndarray, "p e k"]
 
 
@@ -205,6 +205,14 @@ class Step(FitComparison):
     nameless: tuple[str, ...] = ()
     also_called: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
+    @property
+    def in_words(self) -> str:
+        """Its name; what has none in the words of its descriptions, or of the change of the instrument."""
+        if self.descriptions:
+            return "; ".join(_sentence(*entry)["words"] for entry in self.descriptions)
+        change = self.choices.get("change", "")
+        return f"{self.effect} ({change})" if change else self.effect
+
 
 @dataclasses.dataclass(frozen=True)
 class Unexplained:
@@ -212,7 +220,8 @@ class Unexplained:
 
     `chi2_before` and `chi2_after` are without and with that term, `change_of_qu` is what it changes in calibrated q
     and u of a star with p ≤ 5 %. `parts` are names that were taken out again because they explain a part only, with
-    what they leave.
+    what they leave. `number` is the number that the set states which, if it is wrong, is the explanation: it leaves
+    nothing but noise.
     """
 
     p_value: float
@@ -223,6 +232,7 @@ class Unexplained:
     chi2_after: float = float("nan")
     change_of_qu: float = float("nan")
     parts: tuple[str, ...] = ()
+    number: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,6 +291,11 @@ class Diagnosis(Drawn):
     rounds: tuple[Any, ...] = ()
     not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
     descriptions: int = 0
+
+    @property
+    def complete(self) -> bool:
+        """True if nothing is left that the model found does not explain."""
+        return self.verdict in ("consistent", "effect_found")
 
     def why(self, name: str) -> str:
         """Reasons for which an effect, a description or a change of the instrument was not named, with numbers.
@@ -348,7 +363,9 @@ class Diagnosis(Drawn):
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
-        names = [step.effect for step in self.steps] + ["something without a name"] * bool(self.unexplained)
+        names = [step.in_words for step in self.steps]
+        if self.unexplained is not None:
+            names.append(self.unexplained.number or "something without a name")
         verdict = "not examined" if self.after.verdict is None else self.after.verdict.words
         return Display(
             title=f"Diagnosis: {self.verdict.replace('_', ' ')}; fit {verdict}",

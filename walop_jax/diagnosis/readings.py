@@ -1,19 +1,8 @@
-"""Recording mistakes, tried where a fit explains nothing: other readings of the data.
+"""Recording mistakes: other readings of the data, each with its remedy and the set rewritten as the remedy says.
 
 Cameras in another order, angles that run the other way or start elsewhere, a field that is mirrored, turned or in
-other units, a polariser that was not in the beam, another instrument: each makes residuals far beyond what any effect
-makes, and each is undone by rewriting the set. An alternative is worth the χ² of a fit of the rewritten set at a few
-field points,
-
-    χ²(θ₀ + δ),   δ = −(JᵀJ/s² + P)⁻¹ (Jᵀr/s² + P(θ₀ − θ_prior)),
-
-after one Gauss–Newton step from the model as designed, the errors of the data scaled by s as the fit of the set as it
-stands asks for, so that priors hold what residuals of a wrong model would bend. The best ones take more steps. What
-brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left, and below what a fit would call far
-off, is reported.
-
-Symbols     J, r Jacobian and whitened residuals; P inverse prior variances; θ₀ start values.
-Limits      One mix-up at a time. Two that do the same to these data are reported together.
+other units, an element that was not in the beam, or was, another instrument: each makes residuals far beyond what any
+effect makes, and each is undone by rewriting the set. `discrete` compares them.
 """
 
 from __future__ import annotations
@@ -25,151 +14,122 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Block, CalibrationSet, Exposures, Points, Position, Sources
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis import thresholds
-from walop_jax.fit.base_model import base_model, model_like
-from walop_jax.fit.refit import FitResult, Vector
-from walop_jax.fit.search import FAR_OFF
+from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import some
-from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Effect
 from walop_jax.model.specification import Model
 
-_POINTS, _FEW = 16, 64  # field points that are looked at; sets of so few are looked at whole
-_STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
-_BEST = 3  # alternatives that are looked at again
+FEW = 64  # field points up to which sets are looked at whole
 _ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
-_EXCHANGED = 5  # worst exposures, of which two may have been exchanged
 _NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing, …
 _MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
+_LISTED = 8  # exposures that a sentence lists
 
 Change = Callable[[CalibrationSet], CalibrationSet]
 
 
+def unchanged(calset: CalibrationSet) -> CalibrationSet:
+    """The set as it is."""
+    return calset
+
+
 @dataclasses.dataclass(frozen=True)
 class Alternative:
-    """Another reading of a set: what must have happened, what to do about it, and the set rewritten.
+    """A discrete cause: what must have happened, what to do about it, and the set rewritten, or the model extended.
 
-    `explained` is its χ²/dof at the field points that were looked at.
+    `effects` are what the instrument differs by (a structural effect, another description); `explained` is the χ²/dof
+    at the field points that were looked at.
     """
 
     what: str
     remedy: str
-    change: Change
+    change: Change = unchanged
+    effects: tuple[Effect, ...] = ()
     explained: float = np.inf
 
     def __str__(self) -> str:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
 
+    @property
+    def of_data(self) -> bool:
+        """True if the data are to be corrected, not the model alone."""
+        return self.change is not unchanged
 
-def refuse_mixups(result: FitResult) -> None:
-    """Raise `DataError` with the remedy if another reading of its data explains the residuals of a fit."""
-    if alternatives := mixups_of(result):
-        raise refusal(result, alternatives)
+    def beside(self, other: Alternative) -> Alternative:
+        """This cause and another one together."""
+        return Alternative(
+            f"{self.what}, and {other.what}",
+            f"{self.remedy}; and {other.remedy}",
+            _one_after_the_other(self.change, other.change),
+            (*self.effects, *other.effects),
+        )
 
-
-def mixups_of(result: FitResult) -> tuple[Alternative, ...]:
-    """The readings of the data that explain the residuals of a fit, best first."""
-    return mixups(result.calset, result.model, result.chi2 / result.dof) if result.dof > 0 else ()
-
-
-def refusal(result: FitResult, alternatives: Sequence[Alternative]) -> DataError:
-    """The error of data that other readings explain."""
-    reasons = "; or if ".join(str(alternative) for alternative in alternatives)
-    return DataError(
-        f"the model does not fit (χ²/dof = {result.chi2 / result.dof:.3g}); it would if {reasons}"
-    )
-
-
-def mixups(calset: CalibrationSet, model: Model, left: float) -> tuple[Alternative, ...]:
-    """The readings of the data that explain them, best first, where a fit misses them by a per cent or more.
-
-    `left` is the χ²/dof of a fit of `model`.
-    """
-    if left < thresholds.POOR_FIT:
-        return ()
-    # The program that a small set was fitted with is there already.
-    few = calset if len(calset.points) <= _FEW else thinned(calset, _POINTS, neighbours=1)
-    block = few.intensities.block(0, len(few.points))
-    lit = block.used[..., None] & (block.counts > 0)
-    if not lit.any():
-        return ()
-    # A mistake in all exposures misses all of the light by so much.
-    coarse = np.median(block.sigma[lit] / block.counts[lit]) * np.sqrt(left) >= thresholds.READING_COARSE
-    few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    likelihood = Likelihood.of(few, model)
-    stands, values = _misfit(likelihood, left, _STEPS[1])
-    left = min(left, stands)
-    if left < thresholds.POOR_FIT:  # the fit has lost its way, not the data
-        return ()
-    of_all = (_readings(few, model), _instruments(few)) if coarse and left >= FAR_OFF else ()
-    for readings in (_of_some_exposures(likelihood, _worst_exposures(likelihood, values)), *of_all):
-        tried = [_judged(item, few, model, left, _STEPS[0]) for item in readings]
-        tried = sorted(tried, key=lambda item: item.explained)[:_BEST]
-        best = [_judged(item, few, model, item.explained, _STEPS[1]) for item in tried]
-        enough = min(1.0 + (left - 1.0) / thresholds.PART, FAR_OFF)
-        good = sorted((item for item in best if item.explained < enough), key=lambda item: item.explained)
-        if good:
-            alike = thresholds.READING_ALIKE * good[0].explained
-            return tuple(item for item in good if item.explained < alike)
-    return ()
+    def in_some(self, chosen: Bool[np.ndarray, " e"], where: str) -> Alternative:
+        """The same mistake in some of the exposures alone; `where` names them."""
+        return dataclasses.replace(
+            self,
+            what=f"{self.what} in {where}",
+            remedy=f"{self.remedy}, in {where} alone",
+            change=lambda calset: in_some_exposures(calset, self.change(calset), chosen),
+        )
 
 
-def _judged(
-    item: Alternative, calset: CalibrationSet, model: Model, misfit: float, steps: int
-) -> Alternative:
-    """An alternative with χ²/dof after some Gauss–Newton steps from the model as designed; ∞ where none can be made."""
-    try:
-        rewritten = item.change(calset)
-        if rewritten.instrument != calset.instrument:
-            model = base_model(rewritten)
-        elif rewritten.sources is not calset.sources:  # their priors
-            model = model_like(rewritten, model)
-        return dataclasses.replace(item, explained=_misfit(Likelihood.of(rewritten, model), misfit, steps)[0])
-    except (ValueError, np.linalg.LinAlgError):
-        return item
+def _one_after_the_other(first: Change, second: Change) -> Change:
+    """Both changes of a set; none where neither changes it."""
+    if first is unchanged:
+        return second
+    return first if second is unchanged else lambda calset: second(first(calset))
 
 
-def _misfit(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
-    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for; and where.
+def in_some_exposures(
+    calset: CalibrationSet, other: CalibrationSet, chosen: Bool[np.ndarray, " e"]
+) -> CalibrationSet:
+    """A set with the chosen exposures, and their intensities, of another one of the same field points."""
+    old, new = calset.exposures, other.exposures
+    plain = [field.name for field in dataclasses.fields(old) if field.name != "positions"]
+    columns = {name: np.where(chosen, getattr(new, name), getattr(old, name)) for name in plain}
+    positions = {}
+    for prefix, at in old.positions.items():
+        then = new.position(prefix)
+        pairs = ((then.inside, at.inside), (then.angle, at.angle), (then.turn, at.turn))
+        positions[prefix] = Position(*(np.where(chosen, *pair) for pair in pairs))
+    calset = dataclasses.replace(calset, exposures=Exposures(**columns, positions=positions))
+    if other.intensities is calset.intensities:
+        return calset
+    there = other.intensities.block(0, len(other.points))
+    return with_block(
+        lambda b: {
+            "counts": np.where(chosen[:, None], there.counts, b.counts),
+            "sigma": np.where(chosen[:, None], there.sigma, b.sigma),
+            "used": np.where(chosen, there.used, b.used),
+            "source": np.where(chosen, there.source, b.source),
+        }
+    )(calset)
 
-    The smallest of all steps, and the values there.
-    """
-    model, least = likelihood.model, before
-    x = model.start[model.free]
-    step, smallest, best = None, np.inf, model.start
-    for number in range(steps + 1):
-        values = model.full(x)
-        step = likelihood.expand(values, np.sqrt(max(least, 1.0)), step)
-        if step.dof <= 0 or not np.isfinite(step.chi2):
-            break
-        least = step.chi2 / step.dof
-        if least < smallest:
-            smallest, best = least, values
-        if number < steps:
-            width = np.sqrt(np.diag(step.matrix))
-            x = x - np.linalg.solve(step.matrix / np.outer(width, width), step.gradient / width) / width
-    return smallest, best
 
-
-def _worst_exposures(likelihood: Likelihood, values: Vector) -> list[int]:
-    """Exposures with the largest mean squared residuals, the worst first."""
-    _, residual = likelihood.residuals(values)
-    square = np.where(likelihood.used[..., None], residual**2, 0.0).sum(axis=(0, 2))
-    mean = square / np.maximum(likelihood.used.sum(axis=0), 1)
-    return np.argsort(-mean, kind="stable")[:_EXCHANGED].tolist()
+def listed(calset: CalibrationSet, chosen: Bool[np.ndarray, " e"]) -> str:
+    """Some exposures in words: by their KIND where they are all of it, else by their numbers."""
+    kind = calset.exposures.kind
+    kinds = np.unique(kind[chosen])
+    if len(kinds) and (chosen == np.isin(kind, kinds)).all() and len(kinds) < len(np.unique(kind)):
+        return f"exposures of kind {' and '.join(kinds)}"
+    return f"exposures {some([str(number) for number in calset.exposures.exposure[chosen]], _LISTED)}"
 
 
 # ------------------------------------------------------------------------------------------- the alternatives
 
 
-def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
+def readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
+    """Readings that concern all exposures: cameras, angles, field points, moving elements in and out."""
     yield from _orders(model)
     yield from _angles(calset)
     yield from _fields(calset, model)
@@ -180,9 +140,33 @@ def _readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
             "set CLP_IN to F and CLP_ANGLE to NaN, or observe again",
             with_part("exposures", lambda e: e.placed(**{POLARISER: Position.out(len(e))})),
         )
+    yield from _in_or_out(calset, model)
 
 
-def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
+def _in_or_out(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
+    """A moving plate that stayed in the beam, or never came there, whatever the exposures say."""
+    e = calset.exposures
+    for prefix in sorted({*e.positions, *model.template.patched().moving()} - {POLARISER}):
+        inside = e.position(prefix).inside if prefix in e.positions else np.zeros(len(e), bool)
+        if inside.any():
+            yield Alternative(
+                f"{prefix} was not in the beam",
+                f"set {prefix}_IN to F and {prefix}_ANGLE to NaN",
+                with_part("exposures", lambda e, prefix=prefix: e.placed(**{prefix: Position.out(len(e))})),
+            )
+        for angle in () if inside.all() else (0.0, 22.5, 45.0, 67.5):
+
+            def stayed(at: Position, angle: float = angle) -> Position:
+                return Position.at(np.where(at.inside, at.angle, angle))
+
+            yield Alternative(
+                f"{prefix} was in the beam, at {angle:g}°, where the exposures say that it was out",
+                f"set {prefix}_IN to T and {prefix}_ANGLE to {angle:g}",
+                with_part("exposures", lambda e, p=prefix, s=stayed: e.placed(**{p: s(e.position(p))})),
+            )
+
+
+def instruments(calset: CalibrationSet) -> Iterator[Alternative]:
     """Those that come with the package; each costs a program of its own, so they come last."""
     for name in shipped():
         if name != calset.instrument:
@@ -193,10 +177,11 @@ def _instruments(calset: CalibrationSet) -> Iterator[Alternative]:
             )
 
 
-def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator[Alternative]:
+def of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator[Alternative]:
     """Readings that concern sky and standards, or single exposures, where these are among the worst."""
     yield from _dead(likelihood)
     calset = likelihood.calset
+    yield from _rotators(calset, calset.exposures[np.array(worst)])
     for what, remedy, concerned, change in _TABLE:
         if concerned(calset, calset.exposures[np.array(worst)]):
             yield Alternative(what, remedy, change)
@@ -209,6 +194,28 @@ def _of_some_exposures(likelihood: Likelihood, worst: Sequence[int]) -> Iterator
             "exchange their EXPOSURE numbers in the table of intensities",
             lambda calset, pair=pair: _exchanged(calset, pair),
         )
+
+
+def _rotators(calset: CalibrationSet, worst: Exposures) -> Iterator[Alternative]:
+    """ROTATOR of another sense, zero or unit, in all exposures that have it and in those of one KIND.
+
+    They come before the signs of Q and U in the catalogue, which do the same to some data: a zero is wrong more often.
+    """
+    kind, turned = calset.exposures.kind, np.isfinite(calset.exposures.rotator)
+    if not np.isfinite(worst.rotator).any():
+        return
+    kinds = np.unique(kind[turned])
+    for what, change in (
+        ("runs the other way", operator.neg),
+        ("is 90° too small", lambda a: a + 90.0),
+        ("is in radians", np.rad2deg),
+    ):
+        item = Alternative(
+            f"ROTATOR {what}", "correct it (docs: conventions)", _with_column("rotator", change)
+        )
+        yield item
+        for name in kinds if len(kinds) > 1 else ():
+            yield item.in_some(kind == name, f"exposures of kind {name}")
 
 
 def _signs_of_stars(calset: CalibrationSet, worst: Sequence[int]) -> Iterator[Alternative]:
@@ -237,7 +244,7 @@ def refuse_dead_cameras(result: FitResult) -> None:
     A fit takes that for a camera that sees little light.
     """
     calset = result.calset
-    block = calset.intensities.block(0, min(len(calset.points), _FEW))
+    block = calset.intensities.block(0, min(len(calset.points), FEW))
     repeated = block.used.sum(axis=0) > 1
     if not repeated.any():
         return
@@ -267,11 +274,11 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
         yield Alternative(
             f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
             "leave them out, or reduce them again",
-            _with_block(lambda b, off=off: {"used": b.used & ~np.isin(np.arange(b.used.shape[1]), off)}),
+            with_block(lambda b, off=off: {"used": b.used & ~np.isin(np.arange(b.used.shape[1]), off)}),
         )
 
 
-def _with_block(change: Callable[[Block], dict[str, np.ndarray]]) -> Change:
+def with_block(change: Callable[[Block], dict[str, np.ndarray]]) -> Change:
     """A set with other intensities: `change` gives the arrays that differ."""
 
     def changed(calset: CalibrationSet) -> CalibrationSet:
@@ -321,10 +328,6 @@ def _has_moon(calset: CalibrationSet, worst: Exposures) -> bool:
     return bool(((worst.kind == "moon") & np.isfinite(worst.ra) & np.isfinite(worst.dec)).any())
 
 
-def _has_rotator(calset: CalibrationSet, worst: Exposures) -> bool:
-    return bool(np.isfinite(worst.rotator).any())
-
-
 def _below(column: str, limit: float) -> Callable[[CalibrationSet, Exposures], bool]:
     """Moon exposures in which a column is nowhere larger."""
 
@@ -348,7 +351,7 @@ def _orders(model: Model) -> Iterator[Alternative]:
         yield Alternative(
             f"the columns of N were in the order {held}",
             f"their order is {', '.join(names)}",
-            _with_block(lambda b, at=list(order): {"counts": b.counts[..., at], "sigma": b.sigma[..., at]}),
+            with_block(lambda b, at=list(order): {"counts": b.counts[..., at], "sigma": b.sigma[..., at]}),
         )
 
 
@@ -367,6 +370,12 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
                 f"{column} {' and '.join(text for text in (runs, starts) if text)}",
                 f"give {'−' if sign < 0 else ''}{column}{f' + {offset:g}°' if offset else ''}",
                 _with_angle(prefix, lambda a, sign=sign, offset=offset: sign * a + offset),
+            )
+        for factor, what in ((2.0, "is half of the angle"), (0.5, "is twice the angle")):
+            yield Alternative(
+                f"{column} {what}",
+                f"give {factor:g} {column}",
+                _with_angle(prefix, lambda a, factor=factor: factor * a),
             )
         if np.nanmax(np.abs(position.angle)) <= 2.0 * np.pi:
             yield Alternative(
@@ -423,11 +432,6 @@ _TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Chang
     ("Q and U of SOURCES were exchanged", "exchange them", _has_stars, _with_sources(lambda q, u: (u, q))),
     ("Q and U of SOURCES are in per cent", "give fractions", _has_stars,
      _with_sources(lambda q, u: (q / 100.0, u / 100.0))),
-    ("ROTATOR runs the other way", "correct it (docs: conventions)", _has_rotator,
-     _with_column("rotator", operator.neg)),
-    ("ROTATOR is 90° too small", "correct it (docs: conventions)", _has_rotator,
-     _with_column("rotator", lambda a: a + 90.0)),
-    ("ROTATOR is in radians", "correct it (docs: conventions)", _has_rotator, _with_column("rotator", np.rad2deg)),
     ("RA is in hours", _AT, _below("ra", 24.0), _with_column("ra", lambda a: 15.0 * a)),
     ("RA is in radians", _AT, _below("ra", 2.0 * np.pi), _with_column("ra", np.rad2deg)),
     ("DEC is in radians", _AT, _below("dec", 0.5 * np.pi), _with_column("dec", np.rad2deg)),

@@ -27,13 +27,13 @@ from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
 from walop_jax.diagnosis.score import Candidate
-from walop_jax.diagnosis.search import State
+from walop_jax.diagnosis.search import Reason, Round, State
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Described
+from walop_jax.model.effects import Described, Effect
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +120,23 @@ class Refits:
             result, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
         )
         return [*trials, *described], {**state.choices, **compared}
+
+    def with_causes(self, state: State, effects: Sequence[Effect]) -> State:
+        """The state with discrete causes of what was missing: fitted from the model as designed, and added."""
+        for effect in effects:
+            result = state.evidence.result
+            self.tell(f"fitting {getattr(effect, 'change', '') or effect.name}")
+            trial = try_effect(result, effect, start=result.model.start)
+            if trial.fit is None or not trial.fit.converged or trial.left > state.evidence.chi2:
+                continue
+            trial = self.confronted(state.evidence, trial)
+            p, reason = (
+                state.evidence.table.p_global,
+                Reason(trial.name, trial.evidence, 0.0, fitted=True, reason=""),
+            )
+            state = dataclasses.replace(self.adopted(state, trial), fits=state.fits + 1)
+            state = dataclasses.replace(state, rounds=(*state.rounds, Round(p, trial.name, (reason,))))
+        return state
 
     def confronted(self, evidence: Examination, trial: Trial) -> Trial:
         """A trial with the exposures and places left out of its fit, and the evidence of each KIND against it."""

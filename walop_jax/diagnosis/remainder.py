@@ -279,17 +279,52 @@ def beside_conditions(
 ) -> Remainder:
     """The end of a search, or the first state where a number that the set states explains more than names do."""
     fits = first.evidence.result, state.evidence.result
-    stated = instead_of_names(conditions, *fits) if conditions.items else ""
+    stated, explained = instead_of_names(conditions, *fits) if conditions.items else ("", False)
     if not stated:
         return state, remainder
     partial = () if remainder is None else remainder.parts
     names = ", ".join([step.effect.name for step in state.steps] or partial) or "none that holds"
     text = f"one number that the set states explains more than names do ({names}), if it is {stated}"
-    return back_to(first, state), Unexplained(first.evidence.table.p_global, text, (), parts=partial)
+    text = f"{_WRONG}; {text}" if explained else text
+    number, p = stated if explained else "", first.evidence.table.p_global
+    return back_to(first, state), Unexplained(p, text, (), parts=partial, number=number)
 
 
-def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -> str:
+def instead_of_a_search(first: State, conditions: Singles) -> Unexplained | None:
+    """The remainder of a gross misfit that a number which the set states explains, if it is wrong; None: there is none.
+
+    Nothing is searched for then: one number that turns such residuals into noise is what happened.
+    """
+    stated = number_alone(first.evidence.result, conditions)
+    if not stated:
+        return None
+    return Unexplained(first.evidence.table.p_global, f"{_WRONG}: {stated}", (), number=stated)
+
+
+_WRONG = "a number that the set states is wrong"
+
+
+def number_alone(result: FitResult, conditions: Singles) -> str:
+    """The number that a set states which, if it is wrong, turns the residuals of a fit into noise; empty: none.
+
+    Fitted are those that explain most of the misfit by a linear step.
+    """
+    missing = (result.chi2 - result.dof) / result.noise_scale**2
+    most = [
+        item
+        for item in conditions.testable
+        if float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) > thresholds.GOOD_SHARE * missing
+    ]
+    if not most:
+        return ""
+    stated, explained = instead_of_names(dataclasses.replace(conditions, items=tuple(most)), result, result)
+    return stated if explained else ""
+
+
+def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -> tuple[str, bool]:
     """The number that the set states which, if wrong, explains the data better than names do; empty: none.
+
+    And whether it leaves nothing but noise.
 
     `conditions` are the `condition_scores` of `before`. Numbers that are as probable are reported together. Where
     nothing was added (`after` is `before`) only what explains the data is reported.
@@ -300,7 +335,7 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     added = after is not before
-    least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str]]()
+    least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
     for current in conditions.clear[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
         for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
@@ -322,8 +357,7 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
             by = " changed by" if stated.value is None else ""
             text = f"{stated.what}{by} {with_error(value, sigma)} {stated.unit}".rstrip()
             text += f" ({stated.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
-            likely.append((worth, text))
-    best = max((worth for worth, _ in likely), default=0.0)
-    return "; or ".join(
-        text for worth, text in sorted(likely, reverse=True) if worth > best - thresholds.EVEN_ODDS
-    )
+            likely.append((worth, text, explained))
+    likely.sort(reverse=True)
+    texts = [text for worth, text, _ in likely if worth > likely[0][0] - thresholds.EVEN_ODDS]
+    return "; or ".join(texts), bool(likely) and likely[0][2]

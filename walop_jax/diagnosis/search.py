@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.exact import Trial, in_words
+from walop_jax.diagnosis.exact import Trial, beyond_prior, in_words
 from walop_jax.diagnosis.examination import Evidence, explains, leaders
-from walop_jax.diagnosis.findings import Choice
+from walop_jax.diagnosis.findings import Choice, descriptions_of
 from walop_jax.diagnosis.hypotheses import Ranked
 from walop_jax.io.text import beside
 from walop_jax.model.effects import Described
@@ -120,12 +120,32 @@ def refused(evidence: Evidence, trial: Trial) -> str:
     if not suffices and not evidence.stands(trial.effect, trial.evidence, fitted):
         best = evidence.best_pattern(fitted=fitted)
         return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
+    if trial.fit is not None and (far := _far_beyond(trial)):
+        return far
     before, after = trial.compared.heldout_before, trial.compared.heldout_after
     if after >= before:
         return (
             f"data that were left out agree worse with it (mean squared residual {before:.4g} → {after:.4g})"
         )
     return f"exposures of {trial.against} speak against it" if trial.against else ""
+
+
+def _far_beyond(trial: Trial) -> str:
+    """An amplitude of an optical description so far beyond its prior that it explains nothing, in words; empty: none.
+
+    Optics that are off by so much are another arrangement. A camera may be: its gain steps where something breaks.
+    """
+    if trial.effect is not Described or trial.fit is None:
+        return ""
+    optical = {change.label for change, *_ in descriptions_of(trial.fit) if not change.of_camera}
+    far = beyond_prior(trial.fit, Described.name)
+    beyond = {
+        name: widths for name, widths in far.items() if name in optical and widths > thresholds.MOST_WIDTHS
+    }
+    if not beyond:
+        return ""
+    name = max(beyond, key=beyond.__getitem__)
+    return f"{name} is {beyond[name]:.0f} widths of its prior, more than {thresholds.MOST_WIDTHS:g}: no explanation"
 
 
 def _least_explained(evidence: Evidence, trial: Trial) -> float:

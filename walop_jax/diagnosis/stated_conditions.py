@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import special
 
 from walop_jax.data.records import ERROR_WORDS, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
@@ -118,19 +119,23 @@ class Scored(NamedTuple):
 class Singles:
     """All single numbers of a fit with their scores; `noise_scale` is that of the scores.
 
-    `asked` are the effects among them, and those that the set cannot show.
+    `asked` are the effects among them, and those that the set cannot show. `of_noise` are numbers that were not asked,
+    since their columns hold the noise of the counts: they were made of N.
     """
 
     items: tuple[Scored, ...] = ()
     noise_scale: float = 1.0
     asked: tuple[Probe, ...] = ()
+    of_noise: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, design: Design) -> Singles:
         """Conditions that the set states, priors, terms of a camera that have one amplitude, effects with a name."""
         effects = _asked_effects(design)
-        rivals = *_conditions(design), *_priors(design), *_of_cameras(design), *_of_catalogue(design, effects)
-        return dataclasses.replace(scored(design, rivals), asked=effects)
+        stated, noise = _without_noise(design, list(_conditions(design)))
+        rivals = *stated, *_priors(design), *_of_cameras(design), *_of_catalogue(design, effects)
+        of_noise = tuple(single.candidate.name for single in noise)
+        return dataclasses.replace(scored(design, rivals), asked=effects, of_noise=of_noise)
 
     @property
     def testable(self) -> list[Scored]:
@@ -143,6 +148,25 @@ class Singles:
         tried = self.testable
         clear = (item for item in tried if corrected_p(item.score.log_p, len(tried)) < thresholds.ALARM)
         return sorted(clear, key=lambda item: item.score.log_p)
+
+
+def _without_noise(design: Design, singles: Sequence[Single]) -> tuple[list[Single], list[Single]]:
+    """Numbers that may be asked, and those whose column holds the noise of the data itself.
+
+    No number of its own can take up the noise: what leaves residuals that scatter far less than noise was made of them.
+    A level of the sky that was computed from N would explain every residual, and by that every other number as well.
+    """
+    residual, free = design.projector(design.residual), design.projector.free
+    square, asked, noise = float(residual @ residual), list[Single](), list[Single]()
+    for single in singles:
+        column = design.projector(single.candidate.columns[:, 0])
+        length = float(column @ column)
+        taken = float(column @ residual) ** 2 / length if length > 0.0 else 0.0
+        made_of_it = (
+            taken > 0.5 * square and special.chdtr(max(free, 1), square - taken) < thresholds.ALARM**2
+        )
+        (noise if made_of_it else asked).append(single)
+    return asked, noise
 
 
 def scored(design: Design, rivals: Sequence[Single]) -> Singles:
@@ -322,7 +346,7 @@ def _condition_in_words(stated: Stated, score: Score) -> str:
 
 def condition_scores(design: Design, what: str = "") -> Singles:
     """The numbers that a set states, or the one that is `what`, each with the score of changing it."""
-    return scored(design, tuple(_conditions(design, what)))
+    return scored(design, _without_noise(design, list(_conditions(design, what)))[0])
 
 
 def _columns(design: Design, statements: Sequence[Stated]) -> Iterator[Float[np.ndarray, " _"]]:

@@ -48,6 +48,7 @@ SEPARATION = 3.0
 LEAST_EVIDENCE = 1.0  # evidence that an effect must be worth to the final model to stay in it
 USEFUL = 2.0  # standard errors by which a term without a name must predict unseen settings better to be kept
 HELD_OUT_WORSE = 0.01  # share by which a diagnosis may predict exposures worse that were left out
+MOST_WIDTHS = 10.0  # prior widths beyond which an amplitude of an optical description explains nothing
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
 MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
 

@@ -41,9 +41,11 @@ from scipy import special
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
+from walop_jax.diagnosis.discrete import refuse_mixups
 from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, candidates_by_points
-from walop_jax.diagnosis.readings import refuse_dead_cameras, refuse_mixups
+from walop_jax.diagnosis.readings import refuse_dead_cameras
+from walop_jax.diagnosis.remedies import remedies
 from walop_jax.diagnosis.score import Blocks, Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
@@ -55,7 +57,7 @@ from walop_jax.diagnosis.variance_components import (
     variance_components,
     with_structure,
 )
-from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_structure, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
@@ -71,6 +73,10 @@ TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
 POINTS_TOGETHER = 64  # field points whose columns are made together: 70 MB of 4000 at 16 exposures
 MULTIPLIED = 4e6  # of those that are multiplied together: 32 MB
+MADE_OF_N = (
+    "{} holds the noise of N: SKY is proportional to N, so it is no level of the sky, and what is left of that in the "
+    "counts was not asked; give the level that was subtracted, or leave SKY out"
+)
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
 UNEVEN = 1.25
@@ -102,14 +108,16 @@ def examined(
     if not (near or as_written):
         refuse_mixups(result)
     field_fit = on_field_points(result)
-    if not near and (scaled := tuple(_errors_too_small(result, seed))):
-        return result.judged(scaled)
-    design = Design.of(sampled(field_fit))
+    seen = sampled(field_fit)
+    cures = () if near else _remedies(result, seen, seed)
+    if cures:
+        return result.judged(remedies=cures)
+    design = Design.of(seen)
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
     pixels = _of_pixels(result)
     components = found_components([*pixels, *variance_components(design)])
-    hidden = None
+    hidden = singles = None
     if near:
         singles = Singles.of(design)
         hidden = hidden_mistakes(design, singles)
@@ -140,6 +148,8 @@ def examined(
     final = final.judged(doubts, structure=_with_summed_pixels(result, structure))
     if unseen := hidden.not_measured() if hidden is not None else ():
         final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
+    for what in singles.of_noise if singles is not None else ():
+        final = final.remarked(MADE_OF_N.format(what))
     return dataclasses.replace(final, hidden=hidden)
 
 
@@ -265,19 +275,17 @@ def stand_in(result: FitResult) -> CalibrationSet:
     return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
 
 
-def _errors_too_small(result: FitResult, seed: int) -> Iterator[str]:
-    """A warning if residuals far larger than the stated errors are nothing but noise."""
-    factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
-    scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
-    field_fit = on_field_points(scaled)
-    design = Design.of(sampled(field_fit))
-    rough = found_components([*variance_components(design), *_of_pixels(scaled)])
-    rough = rough or any(_summed_pixels(result))
-    if pattern_scores(design, seed).p_global >= thresholds.ALARM and not (rough or any(_groups(design))):
-        yield (
-            f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
-            "the gain and the unit of N_ERR"
-        )
+def _remedies(result: FitResult, seen: FitResult, seed: int) -> tuple[str, ...]:
+    """What would turn the residuals of a fit into noise, the best remedy first; `seen` are its field points."""
+    rough = any(_summed_pixels(result)) or any(found_components(_of_pixels(result)))
+
+    def is_noise(fitted: FitResult) -> bool:
+        design = Design.of(fitted)
+        if rough or found_components(variance_components(design)) or any(_groups(design)):
+            return False
+        return pattern_scores(design, seed).p_global >= thresholds.ALARM
+
+    return remedies(seen, is_noise)
 
 
 def _far_from_pixels(result: FitResult) -> Iterator[str]:

@@ -25,14 +25,19 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import Classes, only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
-from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
+from walop_jax.diagnosis.discrete import causes_of, refusal
+from walop_jax.diagnosis.exact import Trial, beyond_prior, context_of, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, describe, descriptions_of
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Hypotheses
-from walop_jax.diagnosis.readings import mixups_of, refusal
 from walop_jax.diagnosis.refits import Refits
-from walop_jax.diagnosis.remainder import beside_conditions, concluded, rival_conditions
+from walop_jax.diagnosis.remainder import (
+    beside_conditions,
+    concluded,
+    instead_of_a_search,
+    rival_conditions,
+)
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
@@ -80,29 +85,44 @@ def diagnose(
         tell(f"looking at {len(sample.points)} of {len(calset.points)} field points")
     tell(Stage("fitting the model", "fitting"))
     before = fit(Likelihood.of(sample, model))
-    readings = () if as_written else mixups_of(before)
-    if readings and readings[0].explained < thresholds.READING_SURE:
-        raise refusal(before, readings)
+    structural = [
+        effect.neutral(context_of(before)) for effect in candidates.effects if effect.is_structural()
+    ]
+    # Amplitudes mean nothing where the fit is far off: what has none is asked first, and ends the comparison.
+    causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
+    far_off = before.noise_scale > 1.0
+    if causes and causes[0].of_data and (far_off or causes[0].explained < thresholds.READING_SURE):
+        raise refusal(before, causes)
     judge = Refits(
         hypotheses=candidates,
         rng=np.random.default_rng(seed),
         tell=tell,
         minutes=np.inf if minutes is None else minutes,
         began=began,
-        most=thresholds.MOST_FITS_FAR_OFF if before.noise_scale > 1.0 else thresholds.MOST_FITS,
+        most=thresholds.MOST_FITS_FAR_OFF if far_off else thresholds.MOST_FITS,
     )
     tell(Stage("scoring every effect and pattern", "scoring"))
     first = State(judge.examined(before))
-    state, remainder = concluded(first, search(first, judge), judge)
+    conditions = condition_scores(first.evidence.design) if far_off else Singles()
+    remainder = instead_of_a_search(first, conditions) if not causes else None
+    if remainder is None:
+        begun = judge.with_causes(first, causes[0].effects if causes else ())
+        state, remainder = concluded(first, search(begun, judge), judge)
+    else:
+        state = first
     explained = state.evidence.result
     # Another reading that comes near competes with names and with other descriptions of the instrument.
-    if remainder and readings and readings[0].explained * explained.dof < explained.chi2:
-        raise refusal(before, readings)
-    conditions = condition_scores(first.evidence.design) if state.steps or remainder else Singles()
-    state, remainder = beside_conditions(first, state, remainder, conditions)
+    if remainder and causes and causes[0].explained * explained.dof < explained.chi2:
+        raise refusal(before, causes)
+    if not conditions.items and (state.steps or remainder):
+        conditions = condition_scores(first.evidence.design)
+    if remainder is None or not remainder.number:
+        state, remainder = beside_conditions(first, state, remainder, conditions)
     after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, added) for step in state.steps)
-    verdict: Outcome = "unexplained" if remainder else "effect_found" if steps else "consistent"
+    verdict: Outcome = "effect_found" if steps else "consistent"
+    if remainder is not None:
+        verdict = "wrong_number" if remainder.number else "unexplained"
     tell("examining the residuals")
     diagnosis = Diagnosis(
         verdict=verdict,

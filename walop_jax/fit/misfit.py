@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import Position
-from walop_jax.fit.outliers import BEYOND, MOST, outlying
+from walop_jax.fit.outliers import BEYOND, outlying
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import PathLike
 from walop_jax.likelihood.layout import thinned
@@ -53,15 +53,9 @@ class Misfit:
         plate = elements.pop(CALIBRATION_PLATE)
         return entries | {"calibration_plate": plate, "elements": elements, "sentences": self.sentences()}
 
-    def advice(self) -> tuple[str, ...]:
-        """The remedy, where single rows spoil the fit."""
-        share = f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off"
-        advice = f"if these are cosmic rays or stars, walop-jax refit --clip {BEYOND:g} leaves them out"
-        return (f"{share}: {advice}",) if 0.0 < self.outliers <= MOST else ()
-
     def reasons(self, warnings: Sequence[str], folder: PathLike | None) -> tuple[str, ...]:
-        """The first reasons against a fit, its `warnings` among them, and the command that shows all of them."""
-        reasons = tuple(dict.fromkeys((*self.advice(), *warnings, *self.sentences())))
+        """The first reasons against a fit, its `warnings` before all, and the command that shows all of them."""
+        reasons = tuple(dict.fromkeys((*warnings, *self.sentences())))
         omitted = len(reasons) - MOST_REASONS
         more = f"{omitted} more, with the misfit by camera and exposure: walop-jax report {folder}"
         return (*reasons[:MOST_REASONS], more)
@@ -79,13 +73,14 @@ class Misfit:
             if set(angles) != {"out"}:
                 groups["calibration plate" if prefix == CALIBRATION_PLATE else f"angle of {prefix}"] = angles
         elements = {name: 100 * value for name, value in self.matrix_element.items()}
+        share = f"{100 * self.outliers:.2g} % of the rows lie more than {BEYOND:g} standard errors off"
         return (
-            *self.advice(),
             f"mean squared residual by camera: {ranked(self.camera)}",
             "; ".join(f"by {name}: {ranked(values)}" for name, values in groups.items()),
             f"disagreement in the matrix, rms over field: {ranked(elements)} (%)",
             f"worst exposure {self.worst_exposure[0]} ({self.worst_exposure[1]:.3g}), "
             f"worst point {point} at ({x:+.3f}, {y:+.3f}) deg ({value:.3g})",
+            *([share] if self.outliers > 0.0 else []),
         )
 
 

@@ -154,12 +154,18 @@ class FitResult(Fitted):
         )
 
     def judged(
-        self, doubts: Sequence[str] = (), *, noiseless: bool = False, structure: Structure = NO_STRUCTURE
+        self,
+        doubts: Sequence[str] = (),
+        *,
+        noiseless: bool = False,
+        structure: Structure = NO_STRUCTURE,
+        remedies: Sequence[str] = (),
     ) -> FitResult:
         """The fit with the verdict on it, given the sentences that its residuals hold against it.
 
         `noiseless` data are expected counts, those of a plan: they may scatter less than their errors. `structure` is
-        what its field points differ by.
+        what its field points differ by. `remedies` are what would explain data that the model does not, the best
+        first: sentences that take the place of the advice to look for missing effects.
         """
         verdict = Verdict(
             chi2=self.chi2,
@@ -167,7 +173,7 @@ class FitResult(Fitted):
             n_data=self.n_data,
             noise_scale=self.noise_scale,
             converged=self.converged,
-            against=tuple(_against(self, doubts, examined=True, noiseless=noiseless)),
+            against=tuple(_against(self, doubts, examined=True, noiseless=noiseless, remedies=remedies)),
             errors_from=self.errors_from,
             structure=structure,
         )
@@ -306,12 +312,20 @@ def with_honest_errors(result: FitResult) -> FitResult:
     return dataclasses.replace(result, covariance=errors, errors_from=made_from, verdict=None)
 
 
-def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noiseless: bool) -> Iterator[Doubt]:
+def _against(
+    result: FitResult,
+    doubts: Sequence[str],
+    *,
+    examined: bool,
+    noiseless: bool,
+    remedies: Sequence[str] = (),
+) -> Iterator[Doubt]:
     """All doubts about a fit, with remarks. The only place where bits and trust are decided.
 
     A χ² that is a few per cent too large while the residuals, once examined, show nothing but noise is put down to the
     stated errors.
     """
+    yield from (Doubt(Quality.DOUBTED, sentence) for sentence in remedies)
     ratio = result.chi2 / max(result.dof, 1)
     excess = Quality.EXCESS_NOISE if ratio > 1.0 + EXCESS_NOISE**2 else Quality(0)
     if not result.converged:
@@ -326,8 +340,8 @@ def _against(result: FitResult, doubts: Sequence[str], *, examined: bool, noisel
         yield Doubt(excess, f"{what} {100 * (np.sqrt(ratio) - 1):.2g} % too small", blocking=False)
     elif not result.explains_data:
         what = f"the model does not explain the data: χ²/dof = {ratio:.4g}, where 1 is expected"
-        advice = "do not use this calibration (walop-jax diagnose looks for missing effects)"
-        yield Doubt(Quality.UNEXPLAINED | excess, f"{what}; {advice}")
+        advice = "" if remedies else " (walop-jax diagnose looks for missing effects)"
+        yield Doubt(Quality.UNEXPLAINED | excess, f"{what}; do not use this calibration{advice}")
     elif result.errors_too_large and not noiseless:
         what = f"χ²/dof = {ratio:.4g}: N_ERR is not the standard error of N"
         advice = "check the gain, and whether N_ERR holds variances or other units"

@@ -32,7 +32,16 @@ JOINED = "; "
 
 def alternatives(instrument: Instrument) -> dict[str, Rearrangement]:
     """All changes of a description that an instrument has places for, by their sentences."""
-    families = (_layers, _turned_plates, _turned_wedges, _beams, _order, _in_or_out, _dispersion)
+    families = (
+        _layers,
+        _turned_plates,
+        _exchanged_plates,
+        _turned_wedges,
+        _beams,
+        _order,
+        _in_or_out,
+        _dispersion,
+    )
     return dict(itertools.chain(*(family(instrument) for family in families)))
 
 
@@ -91,6 +100,21 @@ def _turned_plates(instrument: Instrument) -> Iterator[Named]:
     )
     for place, (what, turn) in itertools.product(_used(instrument, WavePlate), turns):
         yield f"{place} {what}", lambda i, place=place, turn=turn: i.changed(place, axis=turn)
+
+
+def _exchanged_plates(instrument: Instrument) -> Iterator[Named]:
+    """The plates of two arms, each in the place of the other: their axes are exchanged, all else is alike by design."""
+    used = _used(instrument, WavePlate)
+    of_arms = [place for place in used if "." in place]
+    for first, second in itertools.combinations(of_arms, 2):
+        if first.partition(".")[0] == second.partition(".")[0]:
+            continue
+
+        def exchange(i: Instrument, first: str = first, second: str = second) -> Instrument:
+            axes = i.element(first).axis, i.element(second).axis  # type: ignore[attr-defined]
+            return i.changed(first, axis=axes[1]).changed(second, axis=axes[0])
+
+        yield f"{first} and {second} exchanged", exchange
 
 
 def _turned_wedges(instrument: Instrument) -> Iterator[Named]:

@@ -160,7 +160,7 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     fit = display_of(summary, folder / SUMMARY)
     head = fit if diagnosis is None else display_of(diagnosis, folder / "diagnosis.json")
     trusted = bool(summary.get("trusted", summary["converged"]))
-    good = trusted and (diagnosis is None or diagnosis["verdict"] != "unexplained")
+    good = trusted and (diagnosis is None or diagnosis["verdict"] in ("consistent", "effect_found"))
     requirements_shown, go = _asked(run)
     answered = any(name.startswith("good for") for name, _ in head.facts)
     if trusted and requirements_shown is not None and (goal is not None or not answered):
@@ -386,6 +386,13 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
     name, other = shlex.quote(folder), shlex.quote(f"{folder}_diagnosis")
     sets = shlex.join(str(entry["path"]) for entry in run.summary["inputs"]) or "CALSET"
     steps = [("correct stars", f"walop-jax apply {name} STARS.fits -o OUT.fits")] if trusted else []
+    if run.diagnosis is not None and run.diagnosis["verdict"] == "wrong_number":
+        return [
+            (
+                "correct the number that the set states, and fit it again",
+                f"walop-jax refit {sets} -o {name}_again",
+            )
+        ]
     if run.diagnosis is None:
         steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {other}"))
     if run.limits is None and trusted:

@@ -128,6 +128,8 @@ class Kind:
     slots: SlotTerms = dataclasses.field(kw_only=True)
 
 
+OF_CAMERAS = ("gain", "reported gain", "light", "afterglow")
+"""Kinds of changes of counts."""
 KINDS: dict[str, Kind] = {}
 """All kinds by their names, which begin the texts of their changes; filled by the files of their families."""
 
@@ -183,6 +185,11 @@ class Change:
         return not elsewhere and not any(
             item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
         )
+
+    @property
+    def of_camera(self) -> bool:
+        """True if it acts on the counts of cameras, behind all optics."""
+        return self.kind in OF_CAMERAS
 
     @property
     def over_field(self) -> tuple[str, ...]:

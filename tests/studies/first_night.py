@@ -1,0 +1,363 @@
+"""Gross mistakes of a first night: is the first sentence of a diagnosis the right one, and what does it cost?
+
+    python tests/studies/first_night.py [--instrument WALOP-SOUTH] [--only TEXT] [--seed 61] [--seconds 600]
+
+Plates in, out, turned or exchanged; beams and cables exchanged; signs, zeros, orders and units of angles; in all
+exposures, in half of them or in one KIND only; two at once. A set of 4 × 4 field points is simulated for each, changed
+as the mistake changes it, and diagnosed. The first sentence is the reason with which the data are refused, or what the
+headline of the diagnosis says was found. Printed are, for each, whether that is right, the sentence, and CPU seconds:
+those of the first mistakes hold the compilation of the programs that later ones share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from changed_sets import block_of, with_block  # noqa: E402
+
+from walop_jax.data.records import CalibrationSet, Position  # noqa: E402
+from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
+from walop_jax.io.errors import DataError  # noqa: E402
+from walop_jax.model.compiled import switch_on  # noqa: E402
+from walop_jax.model.effects import OtherDescription, effect_by_name  # noqa: E402
+from walop_jax.model.instrument import nominal_instrument  # noqa: E402
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
+from walop_jax.simulation.simulate import simulate  # noqa: E402
+
+WITH_PLATE = ObservingPlan(
+    grid=4,
+    standard_grid=2,
+    polariser_angles=polariser_turn(8, full_turn=True),
+    moon_patches=4,
+    standards=4,
+    plate=(None, 22.5),
+)
+NO_PLATE = dataclasses.replace(WITH_PLATE, plate=(None,))
+CROSSED = dataclasses.replace(
+    WITH_PLATE,
+    instrument=nominal_instrument("WALOP-SOUTH")
+    .changed("half1.plate", axis=lambda axis: axis + 22.5)
+    .changed("half2.plate", axis=lambda axis: axis - 22.5),
+)
+Made = Callable[[int], CalibrationSet]
+Change = Callable[[CalibrationSet], CalibrationSet]
+
+
+class Case(NamedTuple):
+    """A mistake: how its set is made of a seed, and what the first sentence must say (a regular expression)."""
+
+    made: Made
+    said: str
+
+
+def sound(plan: ObservingPlan = WITH_PLATE, effects: tuple[Any, ...] = ()) -> Made:
+    return lambda seed: simulate(plan, seed, effects=list(effects)).calset
+
+
+def told(change: Change, plan: ObservingPlan = WITH_PLATE, effects: tuple[Any, ...] = ()) -> Made:
+    """A set that is written down wrongly."""
+    return lambda seed: change(sound(plan, effects)(seed))
+
+
+def built(change: str, plan: ObservingPlan = WITH_PLATE) -> Made:
+    """A set of an instrument that was put together otherwise."""
+    return sound(plan, (OtherDescription(change=change),))
+
+
+def half(change: Change) -> Change:
+    """The mistake in the second half of the exposures of each KIND, in the order of time."""
+
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        return mixed(calset, change(calset), second_half(calset))
+
+    return changed
+
+
+def second_half(calset: CalibrationSet) -> np.ndarray:
+    """True for the exposures taken after half of all."""
+    return np.arange(len(calset.exposures)) >= len(calset.exposures) // 2
+
+
+def mixed(first: CalibrationSet, second: CalibrationSet, chosen: np.ndarray) -> CalibrationSet:
+    """A set with some exposures and their intensities of a second one."""
+    e, f = first.exposures, second.exposures
+    columns = {
+        field.name: np.where(chosen, getattr(f, field.name), getattr(e, field.name))
+        for field in dataclasses.fields(e)
+        if isinstance(getattr(e, field.name), np.ndarray) and len(getattr(e, field.name)) == len(e)
+    }
+    places = {
+        prefix: Position.at(
+            np.where(
+                chosen,
+                np.where(f.position(prefix).inside, f.position(prefix).angle, np.nan),
+                np.where(at.inside, at.angle, np.nan),
+            )
+        )
+        for prefix, at in e.positions.items()
+    }
+    a, b = block_of(first), block_of(second)
+    at = chosen[None, :, None]
+    calset = with_block(first, counts=np.where(at, b.counts, a.counts), sigma=np.where(at, b.sigma, a.sigma))
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, **columns).placed(**places))
+
+
+def of_kind(kind: str, change: Change) -> Change:
+    """The mistake in the exposures of one KIND alone."""
+    return lambda calset: mixed(calset, change(calset), calset.exposures.kind == kind)
+
+
+def order(*at: int) -> Change:
+    """Columns of N in another order."""
+
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        block = block_of(calset)
+        return with_block(calset, counts=block.counts[..., list(at)], sigma=block.sigma[..., list(at)])
+
+    return changed
+
+
+def placed(prefix: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Another reading of a moving element."""
+    return lambda c: dataclasses.replace(
+        c, exposures=c.exposures.placed(**{prefix: Position.at(turn(c.exposures.position(prefix).angle))})
+    )
+
+
+def column(name: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda c: dataclasses.replace(
+        c, exposures=dataclasses.replace(c.exposures, **{name: turn(getattr(c.exposures, name))})
+    )
+
+
+def field(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        x, y = turn(calset.points.x, calset.points.y)
+        points = dataclasses.replace(calset.points, x=x, y=y)
+        return with_block(dataclasses.replace(calset, points=points), x=x, y=y)
+
+    return changed
+
+
+def stars(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        q, u = turn(calset.sources.q, calset.sources.u)
+        return dataclasses.replace(calset, sources=dataclasses.replace(calset.sources, q=q, u=u))
+
+    return changed
+
+
+def gain(camera: int, factor: float) -> Change:
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        block = block_of(calset)
+        factors = np.where(np.arange(block.counts.shape[-1]) == camera, factor, 1.0)
+        return with_block(calset, counts=block.counts * factors, sigma=block.sigma * np.sqrt(factors))
+
+    return changed
+
+
+def exchanged(kind: str) -> Change:
+    """Intensities of the first two exposures of a KIND that differ exchanged."""
+
+    def changed(calset: CalibrationSet) -> CalibrationSet:
+        block, here = block_of(calset), np.arange(len(calset.exposures))
+        one, other = np.flatnonzero(calset.exposures.kind == kind)[[1, 2]]
+        here[[one, other]] = other, one
+        return with_block(
+            calset, counts=block.counts[:, here], sigma=block.sigma[:, here], used=block.used[:, here]
+        )
+
+    return changed
+
+
+def both(first: Change, second: Change) -> Change:
+    return lambda calset: second(first(calset))
+
+
+def plate_in(plan: ObservingPlan, some: Callable[[CalibrationSet], np.ndarray] | None = None) -> Made:
+    """The calibration plate in the beam where the exposures say that it is out."""
+
+    def made(seed: int) -> CalibrationSet:
+        there = sound(plan, (effect_by_name("chwp_in_beam").of(plan.context()),))(seed)
+        return there if some is None else mixed(sound(plan)(seed), there, some(there))
+
+    return made
+
+
+def plate_out(seed: int) -> CalibrationSet:
+    """The plate out of the beam in all exposures, half of which say that it is in."""
+    said = sound(WITH_PLATE)(seed)
+    out = dataclasses.replace(WITH_PLATE, polariser_angles=2 * WITH_PLATE.polariser_angles, plate=(None,))
+    block = block_of(sound(out)(seed))
+    return with_block(said, counts=block.counts, sigma=block.sigma)
+
+
+def no_polariser(seed: int) -> CalibrationSet:
+    """Light that never saw the polariser, which the exposures say was in."""
+    said = sound(NO_PLATE)(seed)
+    block = block_of(said)
+    through = said.exposures.clp_in
+    mean = block.counts[:, through].mean(axis=1, keepdims=True)
+    rng = np.random.default_rng(seed)
+    counts, sigma = block.counts.copy(), block.sigma.copy()
+    counts[:, through] = rng.poisson(np.broadcast_to(mean, counts[:, through].shape))
+    sigma[:, through] = np.sqrt(counts[:, through] + 900.0)
+    return with_block(said, counts=counts, sigma=sigma)
+
+
+def other_name(calset: CalibrationSet) -> CalibrationSet:
+    name = "WALOP-NORTH" if calset.instrument == "WALOP-SOUTH" else "WALOP-SOUTH"
+    return dataclasses.replace(calset, instrument=name)
+
+
+def site(name: str, turn: Callable[[float], float]) -> Change:
+    return lambda c: dataclasses.replace(
+        c, site=dataclasses.replace(c.site, **{name: turn(getattr(c.site, name))})
+    )
+
+
+PLATE = "chwp.in.beam|chwp in the beam"
+BACKWARDS = "CLP_ANGLE runs the other way"
+SOUTH: dict[str, Case] = {
+    "plate in the beam, whole set": Case(plate_in(NO_PLATE), PLATE),
+    "plate in the beam, second half": Case(plate_in(NO_PLATE, second_half), f"{PLATE}|CHWP.*in the beam"),
+    "plate in the beam, standards alone": Case(
+        plate_in(NO_PLATE, lambda c: c.exposures.kind == "standard"), f"{PLATE}|CHWP.*in the beam"
+    ),
+    "plate never went in": Case(plate_out, "CHWP was not in the beam|chwp left out"),
+    "half2.plate left out": Case(built("half2.plate left out"), "half2.plate left out"),
+    "both wedges turned by 180": Case(
+        built("half1.wedge and half2.wedge turned by 180 deg"), "half1.wedge and half2.wedge turned by 180"
+    ),
+    "half2.plate turned the other way": Case(
+        built("half2.plate turned the other way"), "half2.plate turned the other way"
+    ),
+    "plate + 45": Case(told(placed("CHWP", lambda a: a + 45.0)), "CHWP_ANGLE is 135"),
+    "half2.wedge turned by 180": Case(built("half2.wedge turned by 180 deg"), "half2.wedge turned by 180"),
+    "half2.wedge turned by 90": Case(built("half2.wedge turned by 90 deg"), "half2.wedge turned by 90"),
+    "plates of the arms exchanged": Case(sound(CROSSED), "half1.plate and half2.plate exchanged"),
+    "beams of arm 1 exchanged": Case(told(order(1, 0, 2, 3)), "order E1, O1, O2, E2|half1.*exchanged beams"),
+    "arms exchanged": Case(told(order(2, 3, 0, 1)), "order O2, E2, O1, E1|exchanged cameras"),
+    "cables of E1 and O2 exchanged": Case(told(order(0, 2, 1, 3)), "order O1, O2, E1, E2"),
+    "cables exchanged in the second half": Case(
+        told(half(order(0, 2, 1, 3))), "O1, O2, E1, E2"
+    ),
+    "beams exchanged, standards alone": Case(
+        told(of_kind("standard", order(1, 0, 2, 3))), "E1, O1, O2, E2"
+    ),
+    "polariser backwards": Case(told(placed("CLP", np.negative)), BACKWARDS),
+    "polariser backwards, second half": Case(told(half(placed("CLP", np.negative)), NO_PLATE), BACKWARDS),
+    "polariser + 45": Case(told(placed("CLP", lambda a: a + 45.0)), "CLP_ANGLE is 135"),
+    "polariser + 90": Case(told(placed("CLP", lambda a: a + 90.0)), "CLP_ANGLE is 90"),
+    "polariser in radians": Case(told(placed("CLP", np.deg2rad)), "CLP_ANGLE is in radians"),
+    "polariser angles halved": Case(told(placed("CLP", lambda a: a / 2.0)), "CLP_ANGLE.*half"),
+    "polariser angles doubled": Case(told(placed("CLP", lambda a: 2.0 * a)), "CLP_ANGLE.*(twice|doubl)"),
+    "polariser not in the beam": Case(no_polariser, "polariser was not in the beam"),
+    "polariser slips by 3 deg in mid-run": Case(
+        told(half(placed("CLP", lambda a: a + 3.0)), NO_PLATE), "turn of polariser|CLP_ANGLE"
+    ),
+    "plate backwards": Case(told(placed("CHWP", np.negative)), "CHWP_ANGLE"),
+    "X mirrored": Case(told(field(lambda x, y: (-x, y))), "X runs the other way"),
+    "field turned by 90": Case(told(field(lambda x, y: (y, -x))), "the field is turned by"),
+    "X and Y in arcmin": Case(told(field(lambda x, y: (60.0 * x, 60.0 * y))), "arcmin"),
+    "points shifted by 0.03 deg": Case(
+        told(field(lambda x, y: (x + 0.03, y))), "X of all field points"
+    ),
+    "U of SOURCES of the other sign": Case(told(stars(lambda q, u: (q, -u))), "^U of SOURCES"),
+    "standards in per cent": Case(told(stars(lambda q, u: (100.0 * q, 100.0 * u))), "in per cent"),
+    "ROTATOR of the other sense": Case(told(column("rotator", np.negative)), "ROTATOR runs the other way"),
+    "ROTATOR + 90": Case(told(column("rotator", lambda a: a - 90.0)), "^ROTATOR is 90°"),
+    "ROTATOR of the other sense, Moon alone": Case(
+        told(of_kind("moon", column("rotator", np.negative))), "ROTATOR.*(moon|other way)"
+    ),
+    "RA in hours": Case(told(column("ra", lambda a: a / 15.0)), "RA is in hours"),
+    "clock half a day off": Case(told(column("mjd", lambda t: t + 0.5)), "MJD is 0.5 d"),
+    "clock two hours off": Case(told(column("mjd", lambda t: t + 2.0 / 24.0)), "MJD"),
+    "west longitude": Case(told(site("longitude", lambda v: -v)), "SITELONG"),
+    "two exposures exchanged": Case(told(exchanged("clp")), "intensities of exposures . and . were exchanged"),
+    "camera O2 gains a half in mid-run": Case(told(half(gain(2, 1.5))), "gain of O2"),
+    "South labelled North": Case(told(other_name), "they came from WALOP-SOUTH"),
+    "plate in the beam; polariser backwards": Case(
+        lambda seed: placed("CLP", np.negative)(plate_in(NO_PLATE)(seed)), f"({PLATE}).*|{BACKWARDS}"
+    ),
+    "beams of arm 1 exchanged; X mirrored": Case(
+        told(both(order(1, 0, 2, 3), field(lambda x, y: (-x, y)))), "E1, O1, O2, E2.*X runs|X runs.*E1, O1, O2, E2"
+    ),
+    "cables exchanged; ROTATOR of the other sense": Case(
+        told(both(order(0, 2, 1, 3), column("rotator", np.negative))), "O1, O2, E1, E2.*ROTATOR|ROTATOR.*O1, O2, E1, E2"
+    ),
+    "polariser + 45; U of SOURCES": Case(
+        told(both(placed("CLP", lambda a: a + 45.0), stars(lambda q, u: (q, -u)))),
+        "CLP_ANGLE is 135.*U of|U of.*CLP_ANGLE is 135",
+    ),
+}  # fmt: skip
+
+
+def first_sentence(calset: CalibrationSet) -> str:
+    """What a user reads first: the reason of a refusal, or the headline of the diagnosis."""
+    try:
+        found = diagnose(calset)
+    except (DataError, ValueError) as refused:
+        reasons = str(refused).partition("it would if ")[2] or str(refused)
+        return reasons.partition("; or if ")[0]
+    shown = found.display()
+    return f"{dict(shown.facts)['found']} [{shown.title}]"
+
+
+def used() -> float:
+    """CPU seconds of this process."""
+    spent = resource.getrusage(resource.RUSAGE_SELF)
+    return spent.ru_utime + spent.ru_stime
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", default="", help="mistakes whose name holds this regular expression")
+    parser.add_argument("--seed", type=int, default=61)
+    parser.add_argument("--seconds", type=int, default=600, help="after which a diagnosis is given up")
+    options = parser.parse_args()
+    switch_on()
+
+    def over(*_: object) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGALRM, over)
+    right, asked, spent = 0, 0, []
+    for name, case in SOUTH.items():
+        if not re.search(options.only, name):
+            continue
+        calset = case.made(options.seed)
+        began, wall = used(), time.perf_counter()
+        signal.alarm(options.seconds)
+        try:
+            sentence = first_sentence(calset)
+        except TimeoutError:
+            sentence = f"nothing within {options.seconds} s"
+        signal.alarm(0)
+        good = bool(re.search(case.said, sentence))
+        right, asked = right + good, asked + 1
+        spent.append(used() - began)
+        took = f"{spent[-1]:6.1f} CPU s {time.perf_counter() - wall:6.1f} s"
+        print(f"{'right' if good else 'WRONG'} {took}  {name}: {sentence[:230]}", flush=True)
+    print(f"{right} of {asked} right; CPU s: median {np.median(spent):.1f}, largest {np.max(spent):.1f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
