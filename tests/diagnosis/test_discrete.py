@@ -126,13 +126,13 @@ def test_an_instrument_put_together_otherwise_is_told():
 
 
 def test_of_readings_that_do_the_same_the_rotator_comes_before_the_catalogue():
-    """Standards have a ROTATOR, the Moon has none here: a zero of 90° off is another sign of Q and U."""
+    """Of the standards alone a zero of ROTATOR that is 90° off is another sign of Q and U."""
     made = simulate(SMALL, seed=SEED).calset
     e = made.exposures
-    turned = np.where(e.kind == "standard", e.rotator - 90.0, np.nan)
-    sound = dataclasses.replace(made, exposures=dataclasses.replace(e, rotator=turned))
-    told = causes(sound, base_model(sound), FAR)
-    assert told[0].what == "ROTATOR is 90° too small"
+    turned = np.where(e.kind == "standard", e.rotator - 90.0, e.rotator)
+    bad = dataclasses.replace(made, exposures=dataclasses.replace(e, rotator=turned))
+    told = causes(bad, base_model(bad), FAR)
+    assert told[0].what == "ROTATOR is 90° too small in exposures of kind standard"
     assert "Q and U of SOURCES both had the other sign" in [one.what for one in told]
 
 

@@ -220,7 +220,8 @@ class _Look:
 
     def pairs(self, items: Sequence[Alternative]) -> tuple[Alternative, ...]:
         """Two causes at once that explain the data: of the best alone, each with the best beside it."""
-        firsts = sorted((item for item in self.tried if item.explained < _HELPS * self.left), key=_left)
+        stands, _ = _misfit(self.likelihood, self.left, _STEPS[0])  # as they were tried, not as it was fitted
+        firsts = sorted((item for item in self.tried if item.explained < _HELPS * stands), key=_left)
         for first in firsts[:_BEST]:
             try:
                 calset, model = _applied(first, self.calset, self.model)
