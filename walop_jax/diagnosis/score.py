@@ -465,9 +465,10 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 
 
 def joined_in_batches(columns: Sequence[Matrix]) -> Iterator[tuple[slice, Matrix]]:
-    """The columns of all blocks side by side in float64, some `limits.COLUMNS_TOGETHER` at a time, and their places."""
+    """The columns of all blocks side by side in float64, so many at a time as take little memory, and their places."""
     stop = np.cumsum([0, *(block.shape[1] for block in columns)])
-    group_of = stop[:-1] // limits.COLUMNS_TOGETHER
+    rows = max(1, max(map(len, columns), default=1))
+    group_of = stop[:-1] // max(1, min(limits.COLUMNS_TOGETHER, limits.RESPONSE_NUMBERS // rows))
     for _, group in itertools.groupby(range(len(columns)), lambda number: group_of[number]):
         numbers = list(group)
         joined = np.concatenate([columns[number].T for number in numbers], dtype=float).T
