@@ -43,3 +43,35 @@ def test_a_space_is_that_of_projected_columns(priors, monkeypatch):
     left = whole - jacobian @ np.linalg.lstsq(jacobian, whole)[0]
     np.testing.assert_allclose(space.gram, left.T @ left, rtol=0, atol=1e-12)
     np.testing.assert_allclose(space.before, np.sum(whole**2, axis=0), rtol=1e-12)
+
+
+def test_multiples_of_a_column_are_multiplied_once(monkeypatch):
+    """A space of columns with copies, multiples and zeros is that of all columns; the root spans the same."""
+    monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
+    rng = np.random.default_rng(3)
+    jacobian, base = rng.standard_normal((60, 4)), rng.standard_normal((60, 9)).astype(np.float32)
+    again = (base[:, [2, 5, 7, 7]] * np.array([1.0, -2.0, 0.1, 30.0])).astype(np.float32)
+    columns = [
+        base[:, :3],
+        base[:, 3:4],
+        base[:, 4:],
+        again[:, :3],
+        np.zeros((60, 1), np.float32),
+        again[:, 3:],
+    ]
+    names, widths = "abcdef", [np.ones(own.shape[1]) for own in columns]
+    space = score.ScoreSpace.projected(score.Projector(jacobian), names, widths, columns, exact=3)
+    assert len(space.gram.distinct) == 9 + 1  # column 2 is exact: its copy is one of its own
+    whole = np.hstack(columns).astype(float)
+    left = whole - jacobian @ np.linalg.lstsq(jacobian, whole)[0]
+    length = np.linalg.norm(left, axis=0)
+    scale = np.outer(length, length) + (length[:, None] * length == 0)
+    np.testing.assert_array_less(np.abs(np.asarray(space.gram) - left.T @ left) / scale, 1e-6)
+    for at in space.places().values():
+        np.testing.assert_allclose(space.gram[at, at], left[:, at].T @ left[:, at], rtol=1e-9, atol=1e-15)
+    residual = left @ rng.standard_normal(left.shape[1])
+    assert space._root.rank == 9
+    assert space._root.explained(left.T @ residual) == pytest.approx(residual @ residual, rel=1e-4)
+    np.testing.assert_allclose(
+        space._root.whole @ space._root.whole.T / scale, left.T @ left / scale, atol=1e-5
+    )

@@ -44,7 +44,7 @@ NULL_DRAWS = 1_000
 Vector = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "_ _"]
 Gram = Any
-"""A symmetric matrix whose entries are asked for by index: an array, `Less` or `Blocks`."""
+"""A symmetric matrix whose entries are asked for by index: an array, `Repeated`, `Less` or `Blocks`."""
 Reduction = Callable[[Vector, float], tuple[Vector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
@@ -52,6 +52,8 @@ FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to 
 ROOT_TOLERANCE = 1e-6  # ten times what products in single precision leave
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
 SCALES = np.array([1.0, 0.3, 0.1, 0.03])  # of the numbers of one effect, in widths of their priors
+SKETCHES = 6  # random sums of its entries that a column is recognised by
+SAME = 3e-7  # distance of two columns of unit length that single precision cannot tell apart
 TAIL = 0.2  # share of the draws, those with the smallest p, that give the number of trials
 
 
@@ -193,8 +195,9 @@ class ScoreSpace:
         """The space of candidates, from the columns of each ahead of the projection, in units of `scale`.
 
         Rows beyond those of the columns, of priors, are 0. Products of different candidates beyond the first `exact`
-        amplitudes are taken in single precision: 10⁻⁷ of the lengths of two columns, where a part of 10⁻³ counts. The
-        projected columns of all rows are never there at once.
+        amplitudes are taken in single precision: 10⁻⁷ of the lengths of two columns, where a part of 10⁻³ counts; of
+        those that are multiples of one another there one is multiplied (`Repeated`). The projected columns of all rows
+        are never there at once.
         """
         sizes = [block.shape[1] for block in columns]
         stop = np.cumsum([0, *sizes])
@@ -204,7 +207,9 @@ class ScoreSpace:
         for at, joined in joined_in_batches(columns):
             before[at] = np.einsum("dk,dk->k", joined, joined) / scale**2
             along[:, at] = basis[: len(joined)].T @ joined / scale
-        products, alone = np.zeros((count, count)), [np.zeros((size, size)) for size in sizes]
+        first_of, factor = multiples(columns, count if exact is None else exact)
+        distinct, number = np.unique(first_of, return_inverse=True)
+        products, alone = np.zeros((len(distinct),) * 2), [np.zeros((size, size)) for size in sizes]
         for first in range(0, len(basis), limits.PRODUCT_ROWS):
             rows = slice(first, first + limits.PRODUCT_ROWS)
             remainder = along.T @ -basis[rows].T  # a column of all rows is contiguous
@@ -212,11 +217,10 @@ class ScoreSpace:
                 rows_of_block = block[rows].T
                 remainder[at, : rows_of_block.shape[1]] += rows_of_block / scale
                 square += remainder[at] @ remainder[at].T
-            _add_upper(products, remainder.T, exact)
+            _add_upper(products, remainder[distinct].T if len(distinct) < count else remainder.T, exact)
         _mirror(products)
-        for at, square in zip(places, alone, strict=True):
-            products[at, at] = square
-        return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, products, projector.free)
+        gram = Repeated(products, number, factor, alone)
+        return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, gram, projector.free)
 
     def places(self) -> dict[str, slice]:
         """Slices of the amplitudes, by candidate."""
@@ -337,13 +341,80 @@ class ScoreSpace:
         return smallest
 
 
+class Repeated:
+    """The Gram matrix of columns of which some are multiples (`factor`) of a distinct one (`number`).
+
+    `distinct` are the products of those; `blocks` are the products of the columns of each candidate, in float64.
+    Indices are those of an array of numpy with two axes.
+    """
+
+    def __init__(
+        self, distinct: Matrix, number: Int[np.ndarray, " _"], factor: Vector, blocks: Sequence[Matrix]
+    ) -> None:
+        self.distinct, self.number, self.factor = distinct, number, factor
+        sizes = np.array([len(block) for block in blocks], int)
+        self._owner = np.repeat(np.arange(len(sizes)), sizes)
+        self._in_blocks = np.concatenate([np.zeros(0), *map(np.ravel, blocks)])
+        ends, squares = np.cumsum(sizes), np.cumsum(sizes**2)
+        self._local = np.arange(len(number)) - (ends - sizes)[self._owner]
+        self._row = (squares - sizes**2)[self._owner] + self._local * sizes[self._owner]
+
+    def __getitem__(self, index: tuple[Any, Any]) -> Any:
+        rows, columns = (np.arange(len(self.number))[at] for at in index)
+        if rows.ndim == 1 and columns.ndim == 1:
+            rows, columns = np.ix_(rows, columns)
+        entries = self.distinct[self.number[rows], self.number[columns]]
+        entries = entries * (self.factor[rows] * self.factor[columns])
+        inside = self._owner[rows] == self._owner[columns]
+        return np.where(
+            inside, self._in_blocks[np.where(inside, self._row[rows] + self._local[columns], 0)], entries
+        )
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:, :], dtype)
+
+    def diagonal(self) -> Vector:
+        """Entries of the diagonal."""
+        return self._in_blocks[self._row + self._local]
+
+
+def multiples(columns: Sequence[Matrix], exact: int) -> tuple[Int[np.ndarray, " _"], Vector]:
+    """For every column the first of which it is a multiple, and the factor; the first `exact` are their own.
+
+    Found by a few sums of their entries with random weights, and held against each other in single precision.
+    """
+    count = sum(block.shape[1] for block in columns)
+    first_of, factor = np.arange(count), np.ones(count)
+    if exact >= count:
+        return first_of, factor
+    weights = np.random.default_rng(0).standard_normal((max(map(len, columns)), SKETCHES))
+    known: dict[bytes, tuple[int, Vector, float]] = {}
+    for at, joined in joined_in_batches(columns):
+        length = np.sqrt(np.einsum("dk,dk->k", joined, joined))
+        sketch = weights[: len(joined)].T @ joined
+        for k, j in enumerate(range(at.start, at.stop)):
+            if j < exact:
+                continue
+            if not length[k]:
+                first_of[j], factor[j] = 0, 0.0
+                continue
+            signed = length[k] * (np.sign(sketch[0, k]) or 1.0)
+            unit = joined[:, k] / signed
+            key = (np.round(sketch[:, k] / signed, 4) + 0.0).tobytes()
+            if key not in known:
+                known[key] = j, unit.astype(np.float32), signed
+            elif np.linalg.norm(unit - known[key][1]) < SAME:
+                first_of[j], factor[j] = known[key][0], signed / known[key][2]
+    return first_of, factor
+
+
 class Less:
     """A symmetric matrix P − L Rᵀ of which only the entries that are asked for are made: P is large, L, R are narrow.
 
     Indices are those of an array of numpy with two axes.
     """
 
-    def __init__(self, whole: Matrix, left: Matrix, right: Matrix) -> None:
+    def __init__(self, whole: Gram, left: Matrix, right: Matrix) -> None:
         self.whole, self.left, self.right = whole, left, right
 
     @classmethod
@@ -392,10 +463,15 @@ class _Root:
 
     def __init__(self, gram: Gram, alive: Bool[np.ndarray, " _"]) -> None:
         norm = np.sqrt(np.where(alive, np.clip(gram.diagonal(), 0.0, None), 0.0))
-        nonzero = np.flatnonzero(norm)
+        every = np.flatnonzero(norm)
         self.whole, self.rank = np.zeros((len(norm), 0), np.float32), 0
-        if not len(nonzero):
+        if not len(every):
             return
+        # Of columns that are multiples of one another the first: the others add nothing.
+        whole = gram.whole if isinstance(gram, Less) else gram
+        number = whole.number[every] if isinstance(whole, Repeated) else every
+        _, first, of = np.unique(number, return_index=True, return_inverse=True)
+        nonzero = every[first]
         scaled = np.empty((len(nonzero), len(nonzero)), order="F")  # as LAPACK has it: no copy is made
         for first in range(0, len(nonzero), limits.COLUMNS_TOGETHER):
             at = slice(first, first + limits.COLUMNS_TOGETHER)
@@ -406,9 +482,17 @@ class _Root:
         order = nonzero[pivots - 1]
         self._chosen = order[: self.rank]
         self._first = np.triu(factor[: self.rank, : self.rank]).T * norm[self._chosen, None]
+        root = np.empty((len(nonzero), self.rank), np.float32)
+        root[pivots[: self.rank] - 1] = self._first
+        beyond = order[self.rank :]
+        root[pivots[self.rank :] - 1] = factor[: self.rank, self.rank :].T * norm[beyond, None]
         self.whole = np.zeros((len(norm), self.rank), np.float32)
-        self.whole[self._chosen] = self._first
-        self.whole[order[self.rank :]] = factor[: self.rank, self.rank :].T * norm[order[self.rank :], None]
+        scale = (
+            whole.factor[every] / whole.factor[nonzero][of]
+            if isinstance(whole, Repeated)
+            else np.ones(len(of))
+        )
+        self.whole[every] = root[of] * scale[:, None].astype(np.float32)
 
     def explained(self, scores: Vector) -> float:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""
@@ -465,9 +549,10 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 
 
 def joined_in_batches(columns: Sequence[Matrix]) -> Iterator[tuple[slice, Matrix]]:
-    """The columns of all blocks side by side in float64, some `limits.COLUMNS_TOGETHER` at a time, and their places."""
+    """The columns of all blocks side by side in float64, so many at a time as take little memory, and their places."""
     stop = np.cumsum([0, *(block.shape[1] for block in columns)])
-    group_of = stop[:-1] // limits.COLUMNS_TOGETHER
+    rows = max(1, max(map(len, columns), default=1))
+    group_of = stop[:-1] // max(1, min(limits.COLUMNS_TOGETHER, limits.RESPONSE_NUMBERS // rows))
     for _, group in itertools.groupby(range(len(columns)), lambda number: group_of[number]):
         numbers = list(group)
         joined = np.concatenate([columns[number].T for number in numbers], dtype=float).T

@@ -174,12 +174,12 @@ def scored(design: Design, rivals: Sequence[Single]) -> Singles:
     if not rivals:
         return Singles()
     matrices = [rival.candidate.columns for rival in rivals]
-    columns = np.concatenate([np.zeros((len(design.residual), 0)), *matrices], axis=1)
-    along = design.projector.basis.T @ columns
+    along = np.hstack([design.projector.basis.T @ columns for columns in matrices])
     names, widths = zip(*((r.candidate.name, r.candidate.widths) for r in rivals), strict=True)
     space = ScoreSpace.projected(design.projector, names, widths, matrices)
     residual = design.projector(design.residual)
-    table = space.table(columns.T @ residual, float(residual @ residual))
+    scores = np.concatenate([columns.T @ residual for columns in matrices])
+    table = space.table(scores, float(residual @ residual))
     rest, places = space.gram.diagonal(), space.places().values()
     items = (
         Scored(rival, score, along[:, at], rest[at], space.alive[at])
