@@ -1,12 +1,15 @@
 """The verdict of a fit and a diagnosis ask the same list, and correct for it alike."""
 
+import copy
+import dataclasses
+
 import numpy as np
 import pytest
 from small_run import small_fit
 
 from walop_jax.diagnosis import trust
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.examination import Examination, examine
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import corrected_p
 from walop_jax.diagnosis.trust import candidate_scores
@@ -48,3 +51,14 @@ def test_columns_of_some_points_at_a_time_score_as_all_together(monkeypatch):
         assert found.rank == expected.rank
         assert found.statistic == pytest.approx(expected.statistic, rel=1e-7, abs=1e-9)
         assert found.log_bayes == pytest.approx(expected.log_bayes, rel=1e-7, abs=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "like"), [(1.0, True), (1.02, False)])
+def test_columns_serve_again_while_the_expected_counts_hardly_change(factor, like):
+    """Throughput and fluxes may have changed by a factor in common: light is what a column is made of."""
+    design = Design.of(small_fit())
+    measured = copy.copy(design.measured)
+    measured.model, measured.flux = factor * 1.3 * measured.model, measured.flux / 1.3
+    earlier = object.__new__(Examination)
+    vars(earlier)["design"] = design
+    assert earlier.is_like(dataclasses.replace(design, measured=measured)) == like

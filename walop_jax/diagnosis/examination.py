@@ -23,7 +23,7 @@ from scipy import special
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import SINGLE_EXPOSURES, Design, number_of_columns, strata
+from walop_jax.diagnosis.design import GAIN, SINGLE_EXPOSURES, Design, number_of_columns, strata
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, sentences_of
 from walop_jax.diagnosis.score import (
     Candidate,
@@ -372,7 +372,7 @@ class Examination(Evidence):
 
     def is_like(self, design: Design) -> bool:
         """True if the expected counts of another fit are close enough to reuse its columns."""
-        ours, theirs = self.design.measured.model, design.measured.model
+        ours, theirs = (of.measured.counts_changed_by(GAIN) for of in (self.design, design))
         return bool(np.linalg.norm(ours - theirs) < thresholds.SAME_COUNTS * np.linalg.norm(ours))
 
 
