@@ -10,7 +10,7 @@ field points,
 after one Gauss–Newton step from the model as designed, the errors of the data scaled by s as the fit of the set as it
 stands asks for, so that priors hold what residuals of a wrong model would bend. The best ones take more steps. What
 brings χ²/dof − 1 below a tenth of what the fit of the set as it stands has left, and below what a fit would call far
-off, explains it, and ends the comparison.
+off, explains it. What leaves nothing but noise ends the comparison.
 
 Of the many that concern some of the exposures, of other descriptions, and of two causes at once, only those take such
 steps that are best with the slopes of the model as it stands (`Screen`): the residuals r of each cause at the start
@@ -163,11 +163,17 @@ def causes(
     if described:
         stages.append((lambda: look.screened(described), look.enough))
     stages.append((lambda: instruments(few), look.enough))  # each costs a program of its own
+    near: list[Alternative] = []
     for stage, enough in stages:
-        if found := look.explaining(stage(), enough):
+        found = look.explaining(stage(), enough)
+        if found and found[0].explained < sure:
             return found
+        near += found  # another cause may explain all
     tell("comparing two discrete causes at once")
-    return look.pairs([*of_instrument, *of_some, *of_all, *described])
+    if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
+        return found
+    near.sort(key=_left)
+    return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
 
 
 @dataclasses.dataclass
