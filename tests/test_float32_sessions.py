@@ -125,13 +125,11 @@ def test_what_the_session_compiles_is_refused(single):
     assert mine.dtype == jnp.ones(1).dtype == jnp.float32
 
 
-def test_values_in_float32_are_numbers_and_no_precision():
-    """Rounded values make the instrument that the same numbers in float64 make, in float64."""
+def test_values_in_float32_are_refused_with_what_they_would_cost():
+    """A thickness of 1930 µm in float32 is off by 10⁻⁴ µm, and its gradient would be rounded as well."""
     forward = walop.forward(SMALL)
     rounded = np.asarray(forward.start, np.float32)
-    wanted = jax.tree.leaves(forward.instrument(rounded.astype(np.float64)))
     for values in (rounded, jnp.asarray(rounded)):
-        for leaf, same in zip(jax.tree.leaves(forward.instrument(values)), wanted, strict=True):
-            assert leaf.dtype == same.dtype
-            np.testing.assert_array_equal(leaf, same)
-    assert forward.full(rounded[np.asarray(forward.free)]).dtype == np.float64
+        with pytest.raises(TypeError, match="was given numbers in float32"):
+            forward.instrument(values)
+    assert forward.instrument(rounded.astype(np.float64)) is not None

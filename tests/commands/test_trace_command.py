@@ -57,12 +57,8 @@ def test_an_instrument_may_be_traced_as_it_is():
 
 def test_one_search_for_names_of_effects(call):
     """What nobody is much like goes by what effects are about; a slip of a letter by its looks."""
-    told = [
-        call("docs", "effect", "polariser_encoder").stderr,
-        call("simulate", "--effect", "polariser_encoder=3", "-o", "none.fits").stderr,
-    ]
-    for text in told:
-        assert "did you mean 'clp_zero' or 'clp_wobble'" in " ".join(text.split())
+    told = call("simulate", "--effect", "polariser_encoder=3", "-o", "none.fits").stderr
+    assert "did you mean 'clp_zero' or 'clp_wobble'" in " ".join(told.split())
     assert (
         "did you mean 'wollaston_axis'"
         in call("simulate", "--effect", "wolaston_axs=3", "-o", "n.fits").stderr

@@ -73,7 +73,7 @@ def test_other_columns_are_no_colours(name):
 
 
 def test_identities_go_with_the_stars_without_a_remark():
-    source = table(RA=[10.0, 11.0, 12.0], DEC=[0.0] * 3, SOURCE_ID=[1, 2, 3], parallax=[1.0] * 3)
+    source = table(RA=[110.0, 111.0, 112.0], DEC=[0.0] * 3, SOURCE_ID=[1, 2, 3], parallax=[1.0] * 3)
     assert read_catalogue(source, SOUTH).remarks == ()
 
 

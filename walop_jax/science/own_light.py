@@ -42,6 +42,9 @@ FEWEST = 12  # stars, of which a sample is asked
 FLOOR = 0.002
 """Of the counts, added to the errors: flat fields and calibrations differ by so much from place to place, and a few
 bright stars shall not be all that is asked."""
+LARGEST = 0.5
+"""Change of the balance up to which the linear step holds. A question that needs a larger one to be answered is not
+asked: of stars seen at ROTATOR 0° and 90° alike, a change cancels, and rounding would be told as a change of 280 %."""
 FAR = 25.0  # χ² of q and u from which a star is left out
 _ROUNDS = 5
 _EFFECTIVE = 6.0  # stars that the information on a question is worth at least
@@ -373,6 +376,8 @@ def _answer(fitted: _Fitted, question: int, change: ArmChange) -> ArmChange:
         return change
     spread = float(np.sqrt(np.sum(pull**2) * number / (number - 1.0)))
     errors = (information**-0.5, spread)
+    if max(errors) * (alarms.threshold(alarms.ALARM) + alarms.MOST_LIKELY) > LARGEST:
+        return change
     chances = (_student(size / errors[0], fitted.dof), _student(size / max(spread, 1e-300), number - 1.0))
     return change._replace(size=size, error=max(errors), chance=max(chances))
 
