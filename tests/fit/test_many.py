@@ -16,6 +16,7 @@ from walop_jax.fit.many import ManyFits, refit_many
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import simulate
 
 
@@ -67,10 +68,27 @@ def test_the_table_has_the_scatter_of_the_fits_beside_their_errors():
     assert table["MEAN"][row] == pytest.approx(converged.mean())
 
 
+def test_every_set_has_the_catalogue_of_its_own_standards():
+    """Standards with other catalogue values: priors are those of each set, and a model for all is refused."""
+    one = realisations(4)[0]
+    moved = dataclasses.replace(one.sources, q=one.sources.q + 2e-4)
+    other = dataclasses.replace(one, sources=moved)
+    fits = refit_many([one, other])
+    own = fit(Likelihood.of(other, base_model(other)))
+    free = own.model.free
+    assert np.abs((fits[1].values - own.values)[free] / own.sigma[free]).max() < 1e-3
+    assert np.abs((fits[1].values - fits[0].values)[free] / own.sigma[free]).max() > 0.1
+    with pytest.raises(DataError, match="set 1 has other SOURCES than set 0"):
+        refit_many([one, other], base_model(one))
+
+
 def test_sets_of_another_layout_are_refused_by_their_number():
     one = realisations(4)[0]
-    other = simulate(dataclasses.replace(SMALL, standards=2), seed=SEED).calset
+    longer = simulate(dataclasses.replace(SMALL, polariser_angles=polariser_turn(9)), seed=SEED).calset
     with pytest.raises(DataError, match="set 1 has another layout than set 0"):
-        refit_many([one, other], base_model(one))
+        refit_many([one, longer])
+    other = simulate(dataclasses.replace(SMALL, standards=2), seed=SEED).calset
+    with pytest.raises(DataError, match="set 1 has another model than set 0"):
+        refit_many([one, other])
     with pytest.raises(DataError, match="no sets"):
         refit_many([])

@@ -150,9 +150,10 @@ def refit_many(
 ) -> ManyFits:
     """The joint fit of each of many sets of one layout, in seconds for hundreds of them.
 
-    `model` serves all sets (None: `walop.base_model` of the first). Each fit equals `walop.refit` of its own set, but
-    its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter of every
-    parameter beside its stated error,
+    `model` serves all sets, which must have the SOURCES of the first one then; None: each set has its
+    `walop.base_model`, with the catalogue values of its own standards as priors. Each fit equals `walop.refit` of its
+    own set, but its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter of
+    every parameter beside its stated error,
 
     >>> walop.refit_many(realisations).to_table()["NAME", "SCATTER", "ERROR"]  # doctest: +SKIP
 
@@ -162,21 +163,21 @@ def refit_many(
     began = time.perf_counter()
     if not calsets:
         raise fail("there are no sets to fit", advice="give at least one calibration set")
-    model = model or base_model(calsets[0])
     likelihoods = _likelihoods(calsets, model)
+    model = likelihoods[0].model
     stack = Stack.of([_inputs(one) for one in likelihoods])
     first = fit(likelihoods[0])
     found = {0: first.minimum}
     searches = {
         n: search_of(
-            first.values[model.free],
-            free_scales(model),
+            _nearby(first, likelihoods[n].model)[model.free],
+            free_scales(likelihoods[n].model),
             damping=0.0,  # the minimum of the first set is near: Newton steps, until one of them leads upwards
             far_off=_is_far_off,
         )
         for n in range(1, len(likelihoods))
     }
-    found |= _driven(searches, stack, likelihoods, first.values, progress)
+    found |= _driven(searches, stack, likelihoods, progress)
     results = [first]
     alone = []
     for n in range(1, len(likelihoods)):
@@ -186,7 +187,7 @@ def refit_many(
                 FitResult(
                     likelihood=likelihood,
                     values=minimum.x,
-                    covariance=covariance(model, minimum.expansion),
+                    covariance=covariance(likelihood.model, minimum.expansion),
                     expansion=minimum.expansion,
                     minimum=minimum,
                     seconds=0.0,
@@ -203,29 +204,32 @@ def _is_far_off(expansion: Expansion) -> bool:
     return not expansion.misfit < FAR_OFF
 
 
+def _nearby(first: FitResult, model: Model) -> Float[np.ndarray, " n"]:
+    """Values to start from: those of the first fit, but of parameters that begin elsewhere their own start values."""
+    return np.where(model.start == first.model.start, first.values, model.start)
+
+
 def _driven(
     searches: dict[int, Any],
     stack: Stack,
     likelihoods: Sequence[Likelihood],
-    others: Float[np.ndarray, " n"],
     progress: Callable[[str], None] | None,
 ) -> dict[int, Minimum[Expansion]]:
-    """The minima of searches by their position; `others` are the values of the parameters that are not free."""
+    """The minima of searches by their position."""
     found: dict[int, Minimum[Expansion]] = {}
-    model = likelihoods[0].model
     places = {n: next(search) for n, search in searches.items()}
     while places:
         if progress is not None:
             progress(f"{len(found)} of {len(searches)} fits have ended")
         numbers = list(places)
-        values = np.stack([model.full(places[n], others) for n in numbers])
+        values = np.stack([likelihoods[n].model.full(places[n]) for n in numbers])
         expansions = _expansions(stack, likelihoods, numbers, values)
         places = {}
         for n, expansion in zip(numbers, expansions, strict=True):
             try:
                 places[n] = searches[n].send(expansion)
             except StopIteration as end:
-                found[n] = dataclasses.replace(end.value, x=model.full(end.value.x, others))
+                found[n] = dataclasses.replace(end.value, x=likelihoods[n].model.full(end.value.x))
     return found
 
 
@@ -303,21 +307,30 @@ def _inputs(likelihood: Likelihood) -> tuple[Instrument, Plan, PointData]:
     return likelihood.model.template, layout.plan, data
 
 
-def _likelihoods(calsets: Sequence[CalibrationSet], model: Model) -> list[Likelihood]:
+def _likelihoods(calsets: Sequence[CalibrationSet], given: Model | None) -> list[Likelihood]:
     """The likelihood of each set; a set with the exposures and sources of the first one shares its layout."""
+    model = given or base_model(calsets[0])
     first = Likelihood.of(calsets[0], model)
     if first.layout.interpolated:
         what = f"set 0 has {first.layout.points} field points"
         raise fail(what, advice="whole frames are fitted one by one: walop.refit")
     needs_no_counts = first.plan.exposures.median_counts is None  # else every set has a plan of its own
     likelihoods = [first]
-    for calset in calsets[1:]:
-        if needs_no_counts and all(_same(getattr(calset, what), getattr(calsets[0], what)) for what in FACTS):
+    for n, calset in enumerate(calsets[1:], start=1):
+        differ = [what for what in FACTS if not _same(getattr(calset, what), getattr(calsets[0], what))]
+        if given is not None and "sources" in differ:
+            advice = "leave the model out, so that every set has its own, or fit the set by itself with walop.refit"
+            raise fail(f"set {n} has other SOURCES than set 0, whose priors the model holds", advice=advice)
+        if needs_no_counts and not differ:
             reader = PointReader(calset, first.plan, model.template, first.layout.mirrored)
             points = MeasuredPoints(reader, first.layout)
             likelihoods.append(Likelihood(first.layout, points, first.runner, model))
         else:
-            likelihoods.append(Likelihood.of(calset, model))
+            own = model if given is not None else base_model(calset)
+            if (own.names, own.free.tolist()) != (model.names, model.free.tolist()):
+                advice = "sets that are fitted together need the same parameters: fit it by itself with walop.refit"
+                raise fail(f"set {n} has another model than set 0", advice=advice)
+            likelihoods.append(Likelihood.of(calset, own))
     return likelihoods
 
 
