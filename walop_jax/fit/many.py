@@ -152,8 +152,8 @@ def refit_many(
 
     `model` serves all sets, which must have the SOURCES of the first one then; None: each set has its
     `walop.base_model`, with the catalogue values of its own standards as priors. Each fit equals `walop.refit` of its
-    own set, but its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter of
-    every parameter beside its stated error,
+    own set, but its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter
+    of every parameter beside its stated error,
 
     >>> walop.refit_many(realisations).to_table()["NAME", "SCATTER", "ERROR"]  # doctest: +SKIP
 
