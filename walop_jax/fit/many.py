@@ -23,7 +23,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -241,7 +240,7 @@ def _expansions(
         some = list(numbers[begin : begin + TOGETHER])
         filled = np.array([*some, *[some[-1]] * (min(TOGETHER, len(likelihoods)) - len(some))])
         rows = np.minimum(np.arange(begin, begin + len(filled)), begin + len(some) - 1)
-        normal = Normal(*map(np.asarray, equations_of_many(stack, filled, array(values[rows]))))
+        normal = Normal(*map(np.asarray, equations_of_many(stack.taken(filled), array(values[rows]))))
         for k, n in enumerate(some):
             likelihood = likelihoods[n]
             terms = DataTerms(
@@ -261,7 +260,7 @@ class Stack(eqx.Module):
     """
 
     first: Any
-    varying: tuple[Array, ...]
+    varying: tuple[Array | np.ndarray, ...]
     places: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
@@ -290,13 +289,19 @@ class Stack(eqx.Module):
                 not np.array_equal(column[0], leaf, equal_nan=leaf.dtype.kind == "f") for leaf in column[1:]
             )
         ]
-        return cls(trees[0], tuple(array(np.stack(columns[i])) for i in differ), tuple(differ))
+        return cls(trees[0], tuple(np.stack(columns[i]) for i in differ), tuple(differ))
 
-    def at(self, number: Int[Array, ""]) -> Any:
-        """The tree of that number; may be traced."""
+    def taken(self, numbers: Int[np.ndarray, " m"]) -> Stack:
+        """The trees of some numbers: one program serves any number of sets."""
+        return Stack(
+            self.first, tuple(array(np.asarray(column)[numbers]) for column in self.varying), self.places
+        )
+
+    def tree(self, varying: Sequence[Array]) -> Any:
+        """The tree whose own leaves are `varying`."""
         leaves, structure = jax.tree.flatten(self.first)
-        for place, column in zip(self.places, self.varying, strict=True):
-            leaves[place] = column[number]
+        for place, leaf in zip(self.places, varying, strict=True):
+            leaves[place] = leaf
         return structure.unflatten(leaves)
 
 
@@ -348,19 +353,19 @@ def _same(one: Any, other: Any) -> bool:
 # --------------------------------------------------------------------------------------------------------- the program
 
 
-def _equations_of_many(stack: Stack, numbers: Int[Array, " s"], values: Float[Array, "s n"]) -> Normal:
-    """χ², Jᵀr and JᵀJ of some of the sets, each at its own values of all parameters."""
+def _equations_of_many(stack: Stack, values: Float[Array, "s n"]) -> Normal:
+    """χ², Jᵀr and JᵀJ of the sets of a stack, each at its own values of all parameters."""
 
-    def one(given: tuple[Array, Array]) -> Normal:
-        number, at = given
-        template, plan, data = stack.at(number)
+    def one(given: tuple[Sequence[Array], Array]) -> Normal:
+        varying, at = given
+        template, plan, data = stack.tree(varying)
         residual, slope = engine.residuals_and_slopes(with_values(template)(at), plan, data)
         r, jacobian = residual.reshape(-1), slope.reshape(-1, at.size)
         return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
 
     # One after the other on a CPU, whose cache holds the Jacobian of one set; side by side where there are many cores.
     side_by_side = None if jax.default_backend() == "cpu" else TOGETHER
-    return jax.lax.map(one, (jnp.asarray(numbers), values), batch_size=side_by_side)
+    return jax.lax.map(one, (stack.varying, values), batch_size=side_by_side)
 
 
 equations_of_many = compiled(_equations_of_many, kept_as="equations_of_many")
