@@ -1,6 +1,6 @@
 """Gross mistakes of a first night: is the first sentence of a diagnosis the right one, and what does it cost?
 
-    python tests/studies/first_night.py [--instrument WALOP-SOUTH] [--only TEXT] [--seed 61] [--seconds 600]
+    python tests/studies/first_night.py [--only TEXT] [--seed 61] [--seconds 600]
 
 Plates in, out, turned or exchanged; beams and cables exchanged; signs, zeros, orders and units of angles; in all
 exposures, in half of them or in one KIND only; two at once. A set of 4 × 4 field points is simulated for each, changed
