@@ -11,7 +11,9 @@ Layout      sets are of one layout if their plans have the same structure: as ma
 Start       the first set begins at the start values of the model, as `refit.fit` does; all others begin at its minimum,
             from which they are a few steps away.
 Left over   a search that does not end, or ends far from the data (χ²/dof above `search.FAR_OFF`), is made anew by
-            `refit.fit`, which scales errors and tries plates one order of retardance away; `ManyFits.alone` names it.
+            `refit.fit`, which scales errors and tries plates one order of retardance away; so is one of a model with
+            air gaps, whose fringe orders are tried there, and one whose plates need more wavelength nodes than were
+            laid out. `ManyFits.alone` names these.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum, search_of
-from walop_jax.fit.refit import FitResult, covariance, fit
-from walop_jax.fit.search import FAR_OFF, free_scales
+from walop_jax.fit.refit import FitResult, fit, fit_at
+from walop_jax.fit.search import FAR_OFF, check_identifiable, free_scales
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table
@@ -105,11 +107,12 @@ class ManyFits(Displayed):
         SCATTER is the standard deviation from fit to fit. RATIO, of the scatter to the stated error, is 1 where the
         sets are noise realisations and the stated errors are right, but smaller for a parameter that a prior holds.
         """
-        converged, model = self.converged, self.fits[0].model
+        converged, model, unknown = self.converged, self.fits[0].model, np.full(len(self.names), np.nan)
         values, stated = self.values[converged], self.sigma[converged]
-        scatter = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(len(self.names), np.nan)
-        error = np.sqrt(np.mean(stated**2, axis=0)) if len(values) else np.full(len(self.names), np.nan)
-        mean = values.mean(axis=0) if len(values) else np.full(len(self.names), np.nan)
+        mean = values.mean(axis=0) if len(values) else unknown
+        error = np.sqrt(np.mean(stated**2, axis=0)) if len(values) else unknown
+        scatter = values.std(axis=0, ddof=1) if len(values) > 1 else unknown
+        ratio = np.divide(scatter, error, out=unknown.copy(), where=error > 0)
         return astropy_table(
             {
                 "NAME": (np.array(self.names), "", "parameter"),
@@ -117,11 +120,7 @@ class ManyFits(Displayed):
                 "MEAN": (mean, "", "mean over the converged fits"),
                 "SCATTER": (scatter, "", "standard deviation from fit to fit"),
                 "ERROR": (error, "", "stated standard error, root mean square over the fits"),
-                "RATIO": (
-                    np.divide(scatter, error, out=np.full(len(error), np.nan), where=error > 0),
-                    "",
-                    "",
-                ),
+                "RATIO": (ratio, "", "scatter over stated error"),
             }
         )
 
@@ -163,39 +162,35 @@ def refit_many(
     if not calsets:
         raise fail("there are no sets to fit", advice="give at least one calibration set")
     likelihoods = _likelihoods(calsets, model)
-    model = likelihoods[0].model
+    for one in likelihoods:
+        check_identifiable(one)
     stack = Stack.of([_inputs(one) for one in likelihoods])
     first = fit(likelihoods[0])
-    found = {0: first.minimum}
     searches = {
         n: search_of(
-            _nearby(first, likelihoods[n].model)[model.free],
-            free_scales(likelihoods[n].model),
+            _nearby(first, one.model)[one.model.free],
+            free_scales(one.model),
             damping=0.0,  # the minimum of the first set is near: Newton steps, until one of them leads upwards
             far_off=_is_far_off,
         )
-        for n in range(1, len(likelihoods))
+        for n, one in enumerate(likelihoods)
+        if n > 0
     }
-    found |= _driven(searches, stack, likelihoods, progress)
-    results = [first]
-    alone = []
-    for n in range(1, len(likelihoods)):
-        minimum, likelihood = found[n], likelihoods[n]
-        if minimum.converged and not _is_far_off(minimum.expansion):
-            results.append(
-                FitResult(
-                    likelihood=likelihood,
-                    values=minimum.x,
-                    covariance=covariance(likelihood.model, minimum.expansion),
-                    expansion=minimum.expansion,
-                    minimum=minimum,
-                    seconds=0.0,
-                )
-            )
+    results, alone = [first], []
+    for n, minimum in sorted(_driven(searches, stack, likelihoods, progress).items()):
+        if _is_of_a_single_fit(likelihoods[n], minimum):
+            results.append(fit_at(likelihoods[n], minimum, 0.0))
         else:
             alone.append(n)
-            results.append(fit(likelihood))
+            results.append(fit(likelihoods[n]))
     return ManyFits(tuple(results), tuple(alone), time.perf_counter() - began)
+
+
+def _is_of_a_single_fit(likelihood: Likelihood, minimum: Minimum[Expansion]) -> bool:
+    """True if `refit.fit` would look no further: near the data, no other fringe order, wavelength nodes that serve."""
+    if not minimum.converged or _is_far_off(minimum.expansion) or likelihood.model.gaps():
+        return False
+    return likelihood.following(minimum.x) is likelihood
 
 
 def _is_far_off(expansion: Expansion) -> bool:

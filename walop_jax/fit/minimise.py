@@ -107,28 +107,13 @@ def minimise(
     evaluate: Callable[[Vector], Place],
     start: Vector,
     scale: Vector,
-    *,
-    damping: float = 1.0,
-    maximum_steps: int = MAXIMUM_STEPS,
-    tolerance: float = TOLERANCE,
-    far_off: Callable[[Place], bool] = lambda _: False,
-    secant: bool = False,
-    progress: Callable[[int, Place], None] | None = None,
+    **how: Any,
 ) -> Minimum[Place]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
-    `evaluate(x)` gives the objective and its expansion at x; everything else is explained in `search_of`.
+    `evaluate(x)` gives the objective and its expansion at x; `how` are the other arguments of `search_of`.
     """
-    search = search_of(
-        start,
-        scale,
-        damping=damping,
-        maximum_steps=maximum_steps,
-        tolerance=tolerance,
-        far_off=far_off,
-        secant=secant,
-        progress=progress,
-    )
+    search: Generator[Vector, Place, Minimum[Place]] = search_of(start, scale, **how)
     place = next(search)
     while True:
         try:

@@ -267,7 +267,7 @@ def fit(
     the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.
     """
-    began, model = time.perf_counter(), likelihood.model
+    began = time.perf_counter()
     first = _start(likelihood) if start is None else np.asarray(start, float)
     best = find_minimum(likelihood, first, noise_scale, worth)
     for _ in range(LAYOUTS):
@@ -276,6 +276,15 @@ def fit(
         if likelihood is before:
             break
         best = find_minimum(likelihood, best.x, noise_scale, worth)
+    return fit_at(likelihood, best, time.perf_counter() - began)
+
+
+def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> FitResult:
+    """The fit of a likelihood whose minimum was found (its `x` a full vector) in so many seconds.
+
+    Raises ValueError for a free parameter without a prior on which nothing in the data depends.
+    """
+    model = likelihood.model
     if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
         what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
         them = "it" if len(idle) == 1 else "them"
@@ -286,7 +295,7 @@ def fit(
         covariance=covariance(model, best.expansion),
         expansion=best.expansion,
         minimum=best,
-        seconds=time.perf_counter() - began,
+        seconds=seconds,
     )
 
 
