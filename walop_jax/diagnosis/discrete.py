@@ -145,7 +145,7 @@ def causes(
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
     sure = thresholds.READING_SURE
     stages: list[tuple[Callable[[], Iterable[Alternative]], float]] = [
-        (lambda: look.screened(of_instrument), look.enough),
+        (lambda: look.screen.best(of_instrument), look.enough),
         (lambda: of_some, look.enough),
         (lambda: of_all, look.enough),
         (lambda: look.screen.in_parts(of_all), sure),
@@ -161,7 +161,7 @@ def causes(
         if descriptions and OtherDescription.name not in model.effect_names
     ]
     if described:
-        stages.append((lambda: look.screened(described), look.enough))
+        stages.append((lambda: look.screen.best(described), look.enough))
     stages.append((lambda: instruments(few), look.enough))  # each costs a program of its own
     near: list[Alternative] = []
     for stage, enough in stages:
@@ -219,10 +219,6 @@ class _Look:
                 key=lambda i: (i.explained > equal, place[i.what] if i.explained <= equal else i.explained),
             )
         )
-
-    def screened(self, items: Sequence[Alternative]) -> list[Alternative]:
-        """The few causes that leave least by the slopes of the model as it stands."""
-        return self.screen.best(items)
 
     def pairs(self, items: Sequence[Alternative]) -> tuple[Alternative, ...]:
         """Two causes at once that explain the data: of the best alone, each with the best beside it."""
@@ -323,15 +319,19 @@ class Screen:
                     ranked.append((left, item))
         return _least(ranked)
 
+    def later(self) -> Bool[np.ndarray, "n e"]:
+        """The exposures from the second on, from the third on, …, in the order of their times."""
+        mjd = self.calset.exposures.mjd
+        order = np.argsort(np.where(np.isfinite(mjd), mjd, 0.0), kind="stable")
+        place = np.argsort(order)
+        return place >= np.arange(1, len(mjd))[:, None]
+
     def choices(self) -> Iterator[Bool[np.ndarray, " e"]]:
         """Exposures that may have a mistake in common: from one on, up to one, those of a KIND."""
         e = self.calset.exposures
-        order = np.argsort(np.where(np.isfinite(e.mjd), e.mjd, 0.0), kind="stable")
-        place = np.empty(len(e), int)
-        place[order] = np.arange(len(e))
-        for n in range(1, len(e)):
-            yield place >= n
-            yield place < n
+        for later in self.later():
+            yield later
+            yield ~later
         kinds = np.unique(e.kind)
         for name in kinds if len(kinds) > 1 else ():
             yield e.kind == name
@@ -380,15 +380,12 @@ class Screen:
             Likelihood.of(number.change(self.calset, number.unit, every), self.likelihood.model)
         )
         slope = (slope - self.stands) / number.unit
-        e = self.calset.exposures
-        order = np.argsort(np.where(np.isfinite(e.mjd), e.mjd, 0.0), kind="stable")
-        later = np.array([np.isin(np.arange(len(e)), order[n:]) for n in range(1, len(e))])
-        options = later if chosen is None else chosen[None]
+        options = self.later() if chosen is None else chosen[None]
         if not len(options):
             return every, 0.0, 0.0
         _, of_rows = self.sums(self.stands)
         square, along = self.sums(slope)
-        product = np.bincount(self.exposure, slope * self.stands, minlength=len(e))
+        product = np.bincount(self.exposure, slope * self.stands, minlength=len(every))
         taken = options @ along
         scores = options @ product - taken @ (of_rows.sum(axis=0) + self.of_priors[1])
         information = options @ square - np.sum(taken**2, axis=1)

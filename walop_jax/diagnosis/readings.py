@@ -24,11 +24,11 @@ from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import some
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.cameras import other_orders
 from walop_jax.model.effects import Effect
 from walop_jax.model.specification import Model
 
 FEW = 64  # field points up to which sets are looked at whole
-_ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 _NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing, …
 _MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
@@ -340,13 +340,7 @@ def _below(column: str, limit: float) -> Callable[[CalibrationSet, Exposures], b
 
 def _orders(model: Model) -> Iterator[Alternative]:
     names = model.template.cameras.names
-    count = len(names)
-    if count <= _ALL_ORDERS:
-        orders = list(itertools.permutations(range(count)))[1:]
-    else:
-        pairs = itertools.combinations(range(count), 2)
-        orders = [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
-    for order in orders:
+    for order in other_orders(len(names)):
         held = ", ".join(names[k] for k in np.argsort(order))
         yield Alternative(
             f"the columns of N were in the order {held}",

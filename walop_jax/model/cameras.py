@@ -15,6 +15,7 @@ stage, that of its class:
 from __future__ import annotations
 
 import abc
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -161,6 +162,18 @@ class Cameras(Component):
         for a, b in self.pairs:
             partners[a], partners[b] = b, a
         return tuple(partners)
+
+
+ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
+
+
+def other_orders(count: int) -> list[tuple[int, ...]]:
+    """Orders in which so many cameras may have been written by mistake: all others, or of many cameras those with two
+    exchanged. Camera k is found at `order[k]`."""
+    if count <= ALL_ORDERS:
+        return list(itertools.permutations(range(count)))[1:]
+    pairs = itertools.combinations(range(count), 2)
+    return [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
 
 
 def with_floor(

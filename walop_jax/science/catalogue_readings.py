@@ -30,6 +30,7 @@ from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, col
 from walop_jax.data.settings import BUILTIN_FILTERS, Settings
 from walop_jax.instruments.description import shipped
 from walop_jax.io.text import with_minus_sign
+from walop_jax.model.cameras import other_orders
 from walop_jax.science.estimate import estimate
 from walop_jax.science.instrument_changes import LARGEST
 from walop_jax.sky.position_angles import sky_to_instrument
@@ -44,7 +45,6 @@ CAP = 50.0  # χ² per degree of freedom beyond which a star is off, however far
 BETTER, ALIKE = 60.0, 30.0  # of the sum, by which a reading must improve it; within which others are as good
 KNOWN = 0.1  # error of q and u together from which a star says nothing of their scatter
 _STILL = 0.002  # scatter of q and u that is not told from none
-_ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 _MAGNITUDES = 40.0  # |N| that no magnitude reaches
 _STEP = 5.0  # deg, of turns of the field that are tried
 _SHIFTS = 8  # to either side, in the range that is tried: …
@@ -289,11 +289,8 @@ def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) ->
                     order[k] = other
             tried.append(tuple(order))
         tried = [order for order in tried if order != tuple(range(count))]
-    elif count <= _ALL_ORDERS:
-        tried = list(itertools.permutations(range(count)))[1:]
     else:
-        pairs = itertools.combinations(range(count), 2)
-        tried = [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
+        tried = other_orders(count)
     for order in tried:
         held = ", ".join(names[int(k)] for k in np.argsort(order))
         yield CatalogueReading(
