@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from builders import NAN, exposures, monochromatic
+from builders import exposures, monochromatic
+from calibration_in_words import in_words
 
-from walop_jax.calibration.calibration import Product
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.calibration.product import write_calibration
 from walop_jax.data.grid import Grid
@@ -91,7 +92,7 @@ def parameters(*rows: tuple[str, str, float, tuple[float, float] | None, bool]) 
     )
 
 
-def product() -> Product:
+def product() -> Calibration:
     entries = SUMMARY["parameters"]
     sigma = np.array([entry["sigma"] for entry in entries.values()])
     priors = ((15.63, 0.05), (-0.23, 0.001), None, (0.0, 0.1), None)
@@ -99,14 +100,13 @@ def product() -> Product:
     ramp = np.linspace(-0.03, 0.02, 25).reshape(5, 5)
     maps = MatrixMaps(grid, "band", np.stack([ramp + k for k in range(6)]), np.full((6, 5, 5), 2e-4))
     rows = [
-        (name, entry["unit"], NAN if prior is None else prior[0], prior, entry["sigma"] > 0)
+        (name, entry["unit"], entry["value"] if prior is None else prior[0], prior, entry["sigma"] > 0)
         for (name, entry), prior in zip(entries.items(), priors, strict=True)
     ]
-    return Product(
+    return in_words(
         instrument="WALOP-SOUTH",
         parameters=parameters(*rows),
         maps=maps,
-        model_lines=("[model]",),
         values=np.array([entry["value"] for entry in entries.values()]),
         site=Site("SAAO", -32.38, 20.81, 1798.0),
         origin="a hand",

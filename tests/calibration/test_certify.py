@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
+from calibration_in_words import changed
 from handmade_run import parameters
 from test_other_products import product_of
 
@@ -21,15 +20,15 @@ def checked(two_cameras):
     calset = read_calibration_set(two_cameras.write())
     three = parameters(
         ("hwp.retardance", "waves", 0.5, (0.5, 0.25), True),
-        ("throughput.n0.p00", "", NAN, None, False),
-        ("throughput.n1.p00", "", NAN, None, True),
+        ("throughput.n0.p00", "", 1.0, None, False),
+        ("throughput.n1.p00", "", 0.25, None, True),
     )
 
     def check(r: float, first: float = 0.125):
         covariance = np.zeros((3, 3))
         covariance[0, 0], covariance[2, 2] = first**2, 0.25
         covariance[0, 2] = covariance[2, 0] = r * first * 0.5
-        product = dataclasses.replace(
+        product = changed(
             product_of(calset, 2, {}),
             parameters=three,
             values=np.array([0.5, 1.0, 0.25]),

@@ -8,14 +8,15 @@ import shutil
 import numpy as np
 import pytest
 from astropy.io import fits
+from calibration_in_words import changed, contents, in_words
 from effect_scenes import EVERY_CHANGE, STARS
 from handmade_run import parameters
 from same_record import assert_same
 
 import walop_jax.calibration.product
-from walop_jax.calibration.calibration import Product
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps
-from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.grid import Grid
 from walop_jax.fit.model_file import model_without_data, render
@@ -29,7 +30,7 @@ NAN = float("nan")
 
 
 @pytest.fixture
-def product(handmade) -> Product:
+def product(handmade) -> Calibration:
     calset = read_calibration_set(handmade.write())
     rng = np.random.default_rng(5)
     root = rng.standard_normal((3, 3)) * 1e-3
@@ -38,11 +39,11 @@ def product(handmade) -> Product:
     three = parameters(
         ("pupil.magnification", "", 15.63, (15.63, 0.05), True),
         ("collimator.q", "deg-2", 0.0, (0.0, 0.0015), True),
-        ("throughput.n0.p00", "um", NAN, None, False),
+        ("throughput.n0.p00", "um", 0.5, None, False),
     )
     maps = MatrixMaps(grid, "SDSS-r", rng.random((6, 3, 4)), rng.random((6, 3, 4)))
     lines = ("[model]", 'instrument = "WALOP-SOUTH"', "# a comment")
-    return Product(
+    return in_words(
         instrument=calset.instrument,
         parameters=three,
         maps=maps,
@@ -86,7 +87,7 @@ def test_parameters_of_every_description_come_back(product, tmp_path):
     assert len(set(names)) == len(EVERY_CHANGE)
     n = len(names)
     path, lines = tmp_path / "found.fits", tuple(map(in_ascii, render(model).splitlines()))
-    found = dataclasses.replace(
+    found = changed(
         product,
         parameters=tuple(model[name] for name in names),
         model_lines=lines,
@@ -94,28 +95,28 @@ def test_parameters_of_every_description_come_back(product, tmp_path):
         covariance=np.eye(n),
     )
     write_calibration(path, found)
-    again = read_product(path)
+    again = read_calibration(path, any_model=True)
     assert list(again.names) == names
     carried = model_without_data("WALOP-SOUTH", "\n".join(again.model_lines), standards=STARS)
     assert carried.names == model.names
     assert carried.start == pytest.approx(model.start)
 
 
-def test_a_name_that_could_not_be_read_is_not_written(product, tmp_path):
+def test_a_name_that_could_not_be_read_is_refused(product):
     first, second, third = product.parameters
     named = first, dataclasses.replace(second, name="collimator q"), third
-    odd = dataclasses.replace(product, parameters=named)
-    with pytest.raises(DataError, match="'collimator q' is not a parameter name"):
-        write_calibration(tmp_path / "odd.fits", odd)
+    with pytest.raises(ValueError, match="'collimator q': a name has letters"):
+        changed(product, parameters=named)
 
 
 def assert_equal(one, other):
     """Products are equal, arrays bit for bit, all but the place that one of them was read from."""
-    assert_same(dataclasses.replace(one, path=None), dataclasses.replace(other, path=None), "product")
+    kept = ({**contents(calibration), "path": None} for calibration in (one, other))
+    assert_same(*kept, "product")
 
 
 def test_round_trip_is_exact(product, path):
-    back = read_product(path)
+    back = read_calibration(path, any_model=True)
     assert_equal(product, back)
     assert back.content_hash() == product.content_hash()
 
@@ -139,9 +140,9 @@ def test_is_ordinary_fits(path):
 def test_no_sources_no_warnings_no_inputs(product, tmp_path):
     bits = tuple(doubt for doubt in product.verdict.against if not doubt.sentence)
     verdict = dataclasses.replace(product.verdict, against=bits)
-    bare = dataclasses.replace(product, verdict=verdict, inputs=())
+    bare = changed(product, verdict=verdict, inputs=())
     write_calibration(tmp_path / "bare.fits", bare)
-    assert_equal(bare, read_product(tmp_path / "bare.fits"))
+    assert_equal(bare, read_calibration(tmp_path / "bare.fits", any_model=True))
 
 
 def test_signs_are_spelt_out():
@@ -183,26 +184,26 @@ def rewrite(path, change):
 def test_what_is_not_as_written_is_refused(path, change, message):
     rewrite(path, change)
     with pytest.raises(DataError, match=message) as caught:
-        read_product(path)
+        read_calibration(path, any_model=True)
     assert str(path) in str(caught.value)
 
 
 def test_a_calibration_set_is_not_a_product(handmade):
     with pytest.raises(DataError, match="walop-jax refit"):
-        read_product(handmade.write())
+        read_calibration(handmade.write(), any_model=True)
 
 
 def test_missing_truncated_and_alien_files(path, tmp_path):
     with pytest.raises(DataError, match="no such file"):
-        read_product(tmp_path / "none.fits")
+        read_calibration(tmp_path / "none.fits", any_model=True)
     whole = path.read_bytes()
     for length in (0, 100, 2880, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(DataError):
-            read_product(path)
+            read_calibration(path, any_model=True)
     path.write_text("not FITS at all")
     with pytest.raises(DataError, match="FITS"):
-        read_product(path)
+        read_calibration(path, any_model=True)
 
 
 def test_an_existing_product_is_not_lost(product, path, monkeypatch):
@@ -223,11 +224,11 @@ def test_an_existing_product_is_not_lost(product, path, monkeypatch):
 
 def test_inputs_with_foreign_letters(product, tmp_path):
     entry = dataclasses.replace(product.inputs[0], path=tmp_path / "Säugling Ω.fits")
-    write_calibration(tmp_path / "p.fits", dataclasses.replace(product, inputs=(entry,)))
+    write_calibration(tmp_path / "p.fits", changed(product, inputs=(entry,)))
     shutil.move(tmp_path / "p.fits", tmp_path / "Straße.fits")
-    assert "S\\xe4ugling" in str(read_product(tmp_path / "Straße.fits").inputs[0].path)
+    assert "S\\xe4ugling" in str(read_calibration(tmp_path / "Straße.fits", any_model=True).inputs[0].path)
 
 
 def test_shapes_are_checked(product):
     with pytest.raises(ValueError, match="3 parameters"):
-        dataclasses.replace(product, values=np.zeros(2), covariance=np.eye(2))
+        changed(product, values=np.zeros(2), covariance=np.eye(2))

@@ -81,7 +81,7 @@ def test_its_figures_are_of_the_product(given, product):
     from walop_jax.reports.run import FigureSource
 
     source = FigureSource.of(given)
-    np.testing.assert_array_equal(source.rebuilt.covariance, product.covariance)
+    np.testing.assert_array_equal(source.required_calibration.covariance, product.covariance)
     assert walop.plot(given, "matrix") is not None
 
 

@@ -89,7 +89,7 @@ def test_one_amplitude_of_two_kinds_is_one_parameter(told):
     assert product.model[standard].tie == clp
     values = dict(zip(product.model.names, product.values, strict=True))
     assert values[clp] == pytest.approx(values[standard], rel=1e-12)
-    checks = {check.name: check for check in certify(product.product)}
+    checks = {check.name: check for check in certify(product)}
     assert checks["covariance"].passed, checks["covariance"].found
     assert checks["maps"].passed
 

@@ -95,7 +95,7 @@ def test_exposures_with_a_disturbance_of_their_own(clean, tmp_path):
     write_calibration(tmp_path / "calibration.fits", Calibration.from_fit(result.judged()))
     product = read_calibration(tmp_path / "calibration.fits")
     assert product.verdict.errors_from == result.errors_from
-    [check] = [check for check in certify(product.product) if check.name == "covariance"]
+    [check] = [check for check in certify(product) if check.name == "covariance"]
     assert check.passed
     assert "residuals: chi2/dof" in check.found
     np.testing.assert_allclose(product.sigma, result.sigma)

@@ -16,7 +16,7 @@ from own_instrument import OWN
 from small_run import SEED, SMALL
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.commands.plot import plot
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.write import write_calibration_set
@@ -90,7 +90,7 @@ def assert_fits_in_print(figure, millimetres):
 
 def test_figures_of_other_pages_fit_into_a_column(tmp_path):
     handmade_run.make_refit(tmp_path)
-    maps, column = read_product(tmp_path).maps, Canvas(width=89.0 / 25.4)
+    maps, column = read_calibration(tmp_path, any_model=True).maps, Canvas(width=89.0 / 25.4)
     assert_fits_in_print(matrix_change_figure(maps, maps, column), 89.0)
     x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.3, 0.3, 9)] * 2))
     columns = {"x": x, "y": y, "before": 2e-3 * np.hypot(x, 0.1), "p_error": 1e-3 * np.hypot(x, 0.1)}
@@ -198,7 +198,7 @@ def test_plates_go_by_their_names(source):
     """Of an instrument whose first arm has no plate the other one is still HWP2."""
     assert possible(source)["retardance"] == "maps of the retardance of HWP1 and HWP2"
     assert texts("figures")["retardance"] == "maps of the retardance of the half-wave plates"
-    whole, first = source.rebuilt, source.rebuilt.model.template.arms[0]
+    whole, first = source.required_calibration, source.required_calibration.model.template.arms[0]
     bare = dataclasses.replace(
         first,
         elements=tuple(element for element in first.elements if element.name != "plate"),
@@ -217,13 +217,15 @@ def test_retardance_on_the_axis_is_that_of_the_crystals(source):
     """2π/λ Σ (n_o − n_e) d about the optic axis of the quartz, MgF2 crossed against it; no wedge bends this ray."""
     from walop_jax.model import materials
 
-    instrument = source.rebuilt.model.instrument(source.rebuilt.values)
+    instrument = source.required_calibration.model.instrument(source.required_calibration.values)
     lam = 0.62
     quartz, mgf2 = (
         float(crystal.ordinary.refractive_index(lam) - crystal.extraordinary.refractive_index(lam))
         for crystal in (materials.CRYSTALS["quartz"], materials.CRYSTALS["mgf2"])
     )
-    thick = dict(zip(source.rebuilt.model.names, source.rebuilt.values, strict=True))
+    thick = dict(
+        zip(source.required_calibration.model.names, source.required_calibration.values, strict=True)
+    )
     straight = instrument.changed("half1.wedge", angle=0.0)
     found = plate_retardances(straight, np.array([lam]), np.zeros(1), np.zeros(1))[0, 0, 0]
     path = quartz * thick["half1.plate.quartz"] - mgf2 * thick["half1.plate.mgf2"]

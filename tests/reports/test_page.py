@@ -10,6 +10,7 @@ import re
 import handmade_run
 import pytest
 from builders import exposures
+from calibration_in_words import changed
 from handmade_run import FIT, FOUND
 from html_page import Page
 from matplotlib.figure import Figure
@@ -352,17 +353,17 @@ def test_data_are_listed(tmp_path, blank_figures):
 
 def test_angles_that_are_one_are_counted_once():
     turned = exposures(*({"clp_angle": angle} for angle in (-1e-5, 0.0, 90.0, 180.0)))
-    words = dict(data_in_words(dataclasses.replace(handmade_run.product(), exposures=turned)))
+    words = dict(data_in_words(changed(handmade_run.product(), exposures=turned)))
     assert words["Polariser angles"].startswith("2 modulo 180°, widest gap 90°")
 
 
 def test_of_a_single_arm_no_plan_for_p_is_suggested(tmp_path, blank_figures):
     run = read_run(handmade_run.make_refit(tmp_path / "run"))
     assert "walop-jax plan" in Page(render(run)[0]).text
-    maps = run.product.maps
+    maps = run.calibration.maps
     one_arm = dataclasses.replace(maps, values=maps.values[:3], errors=maps.errors[:3])
-    product = dataclasses.replace(run.product, maps=one_arm)
-    assert "walop-jax plan" not in Page(render(dataclasses.replace(run, product=product))[0]).text
+    calibration = changed(run.calibration, maps=one_arm)
+    assert "walop-jax plan" not in Page(render(dataclasses.replace(run, calibration=calibration))[0]).text
 
 
 def test_figures_are_drawn_from_the_run_that_was_given(tmp_path, monkeypatch):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import handmade_run
 import pytest
+from calibration_in_words import contents
 from same_record import assert_same
 
-from walop_jax.calibration.product import read_product, write_calibration
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.diagnosis.detection_limits import DetectionLimits
 from walop_jax.diagnosis.figure_data import read_figure_data, write_figure_data
 from walop_jax.io.text import json_text, read_json
@@ -20,7 +21,7 @@ RECORDS: Mapping[str, tuple[Any, Callable[[Path, Any], None], Callable[[Path], A
     "calibration.fits": (
         handmade_run.product(),
         write_calibration,
-        lambda path: dataclasses.replace(read_product(path), path=None),
+        lambda path: read_calibration(path, any_model=True),
     ),
     "diagnosis.fits": (handmade_run.figure_data(), write_figure_data, read_figure_data),
     "limits.json": (
@@ -36,6 +37,9 @@ def test_a_run_is_read_as_written(tmp_path: Path, name: str):
     record, write, read = RECORDS[name]
     write(tmp_path / name, record)
     again = read(tmp_path / name)
-    assert_same(record, again, name)
+    if isinstance(record, Calibration):
+        assert_same({**contents(record), "path": tmp_path / name}, contents(again), name)
+    else:
+        assert_same(record, again, name)
     write(tmp_path / f"again_{name}", again)
     assert (tmp_path / f"again_{name}").read_bytes() == (tmp_path / name).read_bytes()

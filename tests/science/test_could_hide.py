@@ -78,7 +78,7 @@ def test_it_is_no_go_and_not_fit_for_use(product):
     told = next(one for one in missing if one.needed)
     assert "telescope_polarisation.q" in told.found
     assert "standards" in told.advice
-    (failed,) = [check for check in certify(product.product) if not check.passed and check.name != "parents"]
+    (failed,) = [check for check in certify(product) if not check.passed and check.name != "parents"]
     assert failed.name == "measured"
     assert "telescope_polarisation" in failed.found
 

@@ -40,7 +40,7 @@ from astropy.table import Table  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 from study_options import options_of  # noqa: E402
 
-from walop_jax.calibration.product import read_product, write_calibration  # noqa: E402
+from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
 from walop_jax.fit.base_model import base_model, model_for  # noqa: E402
@@ -110,7 +110,7 @@ def _read_set(path: Path) -> Answer:
 
 
 def _read_product(path: Path) -> Answer:
-    product = read_product(path)
+    product = read_calibration(path, any_model=True)
     return Answer(digest(dataclasses.replace(product, inputs=(), path=None)))
 
 

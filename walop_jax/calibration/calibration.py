@@ -10,7 +10,7 @@ import datetime
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -53,7 +53,6 @@ from walop_jax.model.instrument import Instrument, adapted, build, nominal_instr
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, Vector, effect_context
-from walop_jax.model.standards import standards_of
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
@@ -80,15 +79,60 @@ def now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "")
 
 
+class Written(NamedTuple):
+    """What the file of a calibration holds beside the calibration itself, as it stands there.
+
+    `maps` are those of the matrix over the field, `model_lines` the lines of the model file of the fit, `description`
+    those of the description of an instrument that does not come with the package, `content` is the content hash.
+    """
+
+    maps: MatrixMaps
+    model_lines: tuple[str, ...]
+    description: tuple[str, ...] = ()
+    content: str = ""
+
+
+class UnavailableInstrument(Instrument):
+    """Stands in a model for an instrument that this process cannot build: asking it for anything raises the reason.
+
+    For example the fit had an effect of one's own, and the file that defines the effect was not given.
+    """
+
+    @classmethod
+    def because(cls, reason: Exception) -> UnavailableInstrument:
+        """The instrument that cannot be built for this reason."""
+        self = object.__new__(cls)
+        object.__setattr__(self, "reason", reason)
+        return self
+
+    def __getattribute__(self, name: str) -> Any:
+        # Protocols of Python, such as copy and isinstance, ask for names of their own.
+        if name == "reason" or name.startswith("__"):
+            return object.__getattribute__(self, name)
+        raise object.__getattribute__(self, "reason")
+
+
 @dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
-class Contents:
-    """Contents of a calibration, in memory or in a file: values and covariance of all parameters, and their origin.
+class Calibration(Fitted):
+    """An instrument as fitted: model, values and covariance of all parameters, the verdict, and where they come from.
+
+    In memory and as a file it is the same: `Calibration.from_fit` makes it, `Calibration.read` reads it.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` are
     those of the model over the field, `hidden` are mistakes that would not have been detected; `date` is UTC,
-    `versions` name the software.
+    `versions` name the software. With `draws` of a posterior, matrices and their covariance are means over these
+    instead of the linear propagation of `covariance`.
+
+    `written` is what its file holds beside; `dataclasses.replace` forgets it, so that a changed calibration has maps of
+    its own. Where the model in a file cannot be built here, all that needs no instrument can still be asked for, and
+    `unavailable` is the reason. Raises ValueError for shapes that do not belong together.
+
+    >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
+    >>> m.shape, covariance.shape
+    ((6,), (6, 6))
     """
 
+    model: Model
     values: Vector
     covariance: Matrix
     verdict: Verdict
@@ -101,14 +145,27 @@ class Contents:
     inputs: tuple[InputFile, ...] = ()
     residuals: ResidualMap | None = None
     hidden: Hidden | None = None
+    draws: Float[np.ndarray, "d n"] | None = None
     date: str = dataclasses.field(default_factory=now)
     versions: Mapping[str, str] = dataclasses.field(default_factory=software_versions)
     path: Path | None = None
+    written: dataclasses.InitVar[Written | None] = None
+
+    def __post_init__(self, written: Written | None) -> None:
+        n = len(self.model.parameters)
+        if self.covariance.shape != (n, n):
+            raise ValueError(f"covariance has shape {self.covariance.shape}, there are {n} parameters")
+        if written is not None and self.residuals is not None and self.residuals.arms != written.maps.arms:
+            raise ValueError(
+                f"a residual map of {self.residuals.arms} arms, the matrix has {written.maps.arms}"
+            )
+        object.__setattr__(self, "_written", written)
 
     @property
-    def sigma(self) -> Vector:
-        """Standard errors of all parameters."""
-        return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+    def unavailable(self) -> Exception | None:
+        """The reason why the model of the file cannot be built here; None where it could be."""
+        template = self.model.template
+        return template.reason if isinstance(template, UnavailableInstrument) else None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -121,109 +178,6 @@ class Contents:
             return tuple(f"{where}{sentence}" for sentence in (*unchecked, *unmeasured))
         why = "; ".join(self.verdict.warnings) or "see WARNINGS"
         return (f"{where}this calibration is not trusted: {why}",)
-
-
-def _contents(of: Contents) -> dict[str, Any]:
-    return {entry.name: getattr(of, entry.name) for entry in dataclasses.fields(Contents)}
-
-
-@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
-class Product(Contents):
-    """Contents of `calibration.fits`: the model as a list of parameters and texts, and maps of its matrix.
-
-    `instrument` is a name, `model_lines` are those of the model file of the fit, `description` those of the description
-    of an instrument that does not come with the package. `content` is the content hash of the file that it was read
-    from, which `dataclasses.replace` forgets. Raises ValueError for shapes that do not belong together.
-    """
-
-    instrument: str
-    parameters: tuple[Parameter, ...]
-    maps: MatrixMaps
-    model_lines: tuple[str, ...]
-    description: tuple[str, ...] = ()
-    content: dataclasses.InitVar[str] = ""
-
-    def __post_init__(self, content: str) -> None:
-        _check_shape(self.covariance, self.parameters)
-        if self.residuals is not None and self.residuals.arms != self.maps.arms:
-            raise ValueError(f"a residual map of {self.residuals.arms} arms, the matrix has {self.maps.arms}")
-        object.__setattr__(self, "_content", content)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(p.name for p in self.parameters)
-
-    @property
-    def design(self) -> Instrument:
-        """The instrument as designed: from the description in the file, or the one that comes with the package.
-
-        Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with
-        the class that is missing, for another kind.
-        """
-        if not self.description:
-            return nominal_instrument(self.instrument)
-        name = f"the description of {self.instrument} in the product"
-        return build(parsed("\n".join(self.description), name), elements=defined_elements())
-
-    def rebuilt(self, catalogue: tuple[EffectKind, ...] = EFFECTS) -> Calibration:
-        """The calibration, its model rebuilt from `model_lines`; parameters go by name.
-
-        `catalogue` are the effects that the model may have. Raises ValueError if it cannot be rebuilt, or has other
-        parameters than the file lists.
-        """
-        names = self.names
-        standards = standards_of(self.sources, self.exposures, self.filters)
-        context = effect_context(adapted(self.design, standards=standards), self.exposures)
-        facts = {"standards": standards, "context": context, "catalogue": catalogue}
-        model = model_without_data(self.design, "\n".join(self.model_lines), **facts)
-        if sorted(model.names) != sorted(names):
-            odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
-            what = f"the model of the product has other parameters than it lists ({', '.join(odd[:3])})"
-            raise DataError(f"{what}: it was made by a version with other physics; fit again")
-        order = np.array([names.index(name) for name in model.names])
-        contents, covariance = _contents(self), self.covariance[np.ix_(order, order)]
-        contents |= {"values": self.values[order], "covariance": covariance}
-        if self.hidden is not None:
-            contents["hidden"] = dataclasses.replace(self.hidden, changes=self.hidden.changes[:, order])
-        return Calibration(model=model, file=self, **contents)
-
-    def content_hash(self) -> str:
-        """The content hash of the file that it was read from, or of the one that it would be written as.
-
-        SHA-256 of the instrument as calibrated: not of dates, paths and versions.
-        """
-        from walop_jax.calibration.product import content_of, hdus_of
-
-        return vars(self)["_content"] or content_of(hdus_of(self, self.path))
-
-
-def _check_shape(covariance: Matrix, parameters: Sequence[Parameter]) -> None:
-    n = len(parameters)
-    if covariance.shape != (n, n):
-        raise ValueError(f"covariance has shape {covariance.shape}, there are {n} parameters")
-
-
-@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
-class Calibration(Contents, Fitted):
-    """An instrument as fitted: model, values and covariance of all parameters, and where they come from.
-
-    With `draws` of a posterior, matrices and their covariance are means over these instead of the linear propagation of
-    `covariance`. `file` is the product that it was read from: maps and texts are those of its file, until
-    `dataclasses.replace`, which forgets it. Raises ValueError for shapes that do not belong together.
-
-    >>> m, covariance = walop.Calibration.from_fit(result).matrix(0.1, -0.05)
-    >>> m.shape, covariance.shape
-    ((6,), (6, 6))
-    """
-
-    model: Model
-    draws: Float[np.ndarray, "d n"] | None = None
-    file: dataclasses.InitVar[Product | None] = None
-
-    def __post_init__(self, file: Product | None) -> None:
-        _check_shape(self.covariance, self.model.parameters)
-        object.__setattr__(self, "_file", file)
 
     @classmethod
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
@@ -248,7 +202,7 @@ class Calibration(Contents, Fitted):
             residuals=residuals,
             hidden=result.hidden,
         )
-        return calibration if result.averaged is None else result.averaged(calibration)
+        return calibration if result.alternatives is None else result.alternatives.averaged(calibration)
 
     def with_covariance(self, covariance: Float[np.ndarray, "f f"], errors_from: str) -> Calibration:
         """The calibration with the covariance of a posterior of its fit, made of errors from `errors_from`, now."""
@@ -286,8 +240,14 @@ class Calibration(Contents, Fitted):
 
     @property
     def design(self) -> Instrument:
-        """The instrument as designed."""
-        return self.model.template
+        """The instrument as designed.
+
+        Where the model is `unavailable`, from the description in the file, or the one that comes with the package.
+        Raises `DataError`, with the class that is missing, for a kind of element that this process has not defined.
+        """
+        if self.unavailable is None:
+            return self.model.template
+        return design_of(self.instrument, self.description)
 
     @staticmethod
     def read(path: PathLike, elements: PathLike | Sequence[type] | None = None) -> Calibration:
@@ -472,25 +432,37 @@ class Calibration(Contents, Fitted):
         return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())
 
     @functools.cached_property
-    def product(self) -> Product:
-        """Contents of its file: those of the one that it was read from, or made anew."""
-        return vars(self)["_file"] or Product(
-            **_contents(self),
-            instrument=self.instrument,
-            parameters=self.model.parameters,
-            maps=self.new_maps(),
-            model_lines=_lines(render(self.model)),
-            description=_lines(self.model.template.description),
-        )
+    def maps(self) -> MatrixMaps:
+        """The maps of its file, or made anew."""
+        written = self._as_written
+        return self.new_maps() if written is None else written.maps
 
     @property
-    def maps(self) -> MatrixMaps:
-        """The maps of its file."""
-        return self.product.maps
+    def model_lines(self) -> tuple[str, ...]:
+        """The lines of the model file of the fit."""
+        written = self._as_written
+        return _lines(render(self.model)) if written is None else written.model_lines
+
+    @property
+    def description(self) -> tuple[str, ...]:
+        """The lines of the description of the instrument, if it does not come with the package."""
+        written = self._as_written
+        return _lines(self.model.template.description) if written is None else written.description
+
+    @property
+    def _as_written(self) -> Written | None:
+        return vars(self)["_written"]
 
     def content_hash(self) -> str:
-        """As `Product.content_hash`."""
-        return self.product.content_hash()
+        """The content hash of the file that it was read from, or of the one that it would be written as.
+
+        SHA-256 of the instrument as calibrated: not of dates, paths and versions.
+        """
+        from walop_jax.calibration.product import content_of, hdus_of
+
+        written = self._as_written
+        held = "" if written is None else written.content
+        return held or content_of(hdus_of(self, self.path))
 
     # ------------------------------------------------------------------------------- tables and contents
 
@@ -528,6 +500,43 @@ class Calibration(Contents, Fitted):
             columns["P_ERR"] = error_of_p, "error of p of a star with p <= 5 %, of the calibration alone"
         columns["FLAG"] = flag, "16 high cross-talk, 32 beyond the calibrated field, 64 filter or temperature"
         return columns
+
+
+def design_of(instrument: str, description: Sequence[str]) -> Instrument:
+    """The instrument of the lines of a description, or without any that of the package of this name.
+
+    Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with the
+    class that is missing, for another kind.
+    """
+    if not description:
+        return nominal_instrument(instrument)
+    name = f"the description of {instrument} in the product"
+    return build(parsed("\n".join(description), name), elements=defined_elements())
+
+
+def built_model(
+    instrument: str,
+    written: Written,
+    names: Sequence[str],
+    standards: Any,
+    exposures: Exposures,
+    catalogue: tuple[EffectKind, ...] = EFFECTS,
+) -> Model:
+    """The model of the lines in a file, built anew.
+
+    `names` are the parameters that the file lists, `standards` the polarised standards of its exposures, `catalogue`
+    the effects that it may have. Raises ValueError where it cannot be built, `DataError` where the physics has changed
+    since, so that it has other parameters.
+    """
+    design = design_of(instrument, written.description)
+    context = effect_context(adapted(design, standards=standards), exposures)
+    facts = {"standards": standards, "context": context, "catalogue": catalogue}
+    model = model_without_data(design, "\n".join(written.model_lines), **facts)
+    if sorted(model.names) != sorted(names):
+        odd = sorted(set(model.names) ^ set(names)) or ["one of them twice"]
+        what = f"the model of the product has other parameters than it lists ({', '.join(odd[:3])})"
+        raise DataError(f"{what}: it was made by a version with other physics; fit again")
+    return model
 
 
 def _lines(text: str) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
+from walop_jax.calibration.calibration import UNCHECKED, Calibration
 from walop_jax.calibration.could_hide import could_hide, off_by, shown_by_the_sky_alone, unmeasured
 from walop_jax.calibration.product import validity
 from walop_jax.data.inspection import Finding, about_exposures, sees_the_sky
@@ -21,7 +21,7 @@ from walop_jax.data.records import Exposures
 from walop_jax.data.settings import BUILTIN_FILTERS
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.text import rounded
-from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.effects import EffectKind
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument
 
@@ -42,17 +42,21 @@ class Check(NamedTuple):
     found: str
 
 
-def certify(product: Product, catalogue: tuple[EffectKind, ...] = EFFECTS) -> list[Check]:
-    """All checks of a product in a fixed order, up to a failed rebuild; `catalogue` are effects that it may have."""
-    earlier = UNCHECKED in product.verdict.warnings  # the content of others was checked when they were read
+def certify(calibration: Calibration) -> list[Check]:
+    """All checks of a calibration in a fixed order, up to a model that cannot be built here."""
+    # The content of all other calibrations was checked when they were read.
+    earlier = UNCHECKED in calibration.verdict.warnings
     checks = [Check("content", False, UNCHECKED)] if earlier else []
-    checks += [*_verdict(product), _covariance(product), _validity(product), _parents(product)]
-    try:
-        calibration = product.rebuilt(catalogue)
-    except ValueError as error:
-        return [*checks, Check("model", False, f"cannot be rebuilt: {error}")]
+    checks += [
+        *_verdict(calibration),
+        _covariance(calibration),
+        _validity(calibration),
+        _parents(calibration),
+    ]
+    if calibration.unavailable is not None:
+        return [*checks, Check("model", False, f"cannot be rebuilt: {calibration.unavailable}")]
     checks.append(Check("model", True, f"{len(calibration.model.names)} parameters rebuilt by name"))
-    return [*checks, _maps(product, calibration), _physics(calibration), *_protection(calibration)]
+    return [*checks, _maps(calibration), _physics(calibration), *_protection(calibration)]
 
 
 def lacks(
@@ -71,8 +75,8 @@ def lacks(
             yield Finding("fault", f"{', '.join(unseen)} not measured, {worst} at the usual size", OF_THE_SKY)
 
 
-def _verdict(product: Product) -> list[Check]:
-    v, bits = product.verdict, product.verdict.quality
+def _verdict(calibration: Calibration) -> list[Check]:
+    v, bits = calibration.verdict, calibration.verdict.quality
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
     why = [doubt.sentence for doubt in v.against if doubt.blocking and doubt.sentence]
@@ -84,13 +88,13 @@ def _verdict(product: Product) -> list[Check]:
     ]
 
 
-def _covariance(product: Product) -> Check:
+def _covariance(calibration: Calibration) -> Check:
     """Of the free parameters: those that are held, or tied to others, have no errors of their own."""
-    free = [i for i, p in enumerate(product.parameters) if p.free and p.tie is None]
-    c, sigma = product.covariance[np.ix_(free, free)], product.sigma[free]
-    from_what = f"made from {product.verdict.errors_from}"
+    free = [i for i, p in enumerate(calibration.parameters) if p.free and p.tie is None]
+    c, sigma = calibration.covariance[np.ix_(free, free)], calibration.sigma[free]
+    from_what = f"made from {calibration.verdict.errors_from}"
     if not np.all(sigma > 0):
-        name = product.names[free[int(np.argmin(sigma))]]
+        name = calibration.names[free[int(np.argmin(sigma))]]
         return Check("covariance", False, f"the error of the free parameter {name} is 0; {from_what}")
     correlation = c / np.outer(sigma, sigma)
     lowest = float(np.linalg.eigvalsh(0.5 * (correlation + correlation.T)).min(initial=1.0))
@@ -101,9 +105,11 @@ def _covariance(product: Product) -> Check:
     return Check("covariance", good, f"{what}{' (singular)' if lowest <= SINGULAR else ''}; {from_what}")
 
 
-def _validity(product: Product) -> Check:
-    span = validity(product)
-    unknown = [name for name in span.filters if name not in product.filters and name not in BUILTIN_FILTERS]
+def _validity(calibration: Calibration) -> Check:
+    span = validity(calibration)
+    unknown = [
+        name for name in span.filters if name not in calibration.filters and name not in BUILTIN_FILTERS
+    ]
     good = bool(np.isfinite(span.mjd[0])) and not unknown
     text = f"MJD {span.mjd[0]:.2f} to {span.mjd[1]:.2f}, {', '.join(span.filters)}"
     if np.isfinite(span.temperature[0]):
@@ -111,19 +117,20 @@ def _validity(product: Product) -> Check:
     return Check("validity", good, text + (f"; no curve of {', '.join(unknown)}" if unknown else ""))
 
 
-def _parents(product: Product) -> Check:
-    bad = [entry for entry in product.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
-    good = bool(product.inputs) and not bad
-    text = f"{len(product.inputs)} calibration set(s), hashes recorded" if good else "not known"
+def _parents(calibration: Calibration) -> Check:
+    bad = [entry for entry in calibration.inputs if not re.fullmatch(r"[0-9a-f]{64}", entry.sha256)]
+    good = bool(calibration.inputs) and not bad
+    text = f"{len(calibration.inputs)} calibration set(s), hashes recorded" if good else "not known"
     return Check("parents", good, text)
 
 
-def _maps(product: Product, calibration: Calibration) -> Check:
-    again = calibration.new_maps(product.maps.values.shape[1])
-    if again.grid != product.maps.grid or again.positions != product.maps.positions:
+def _maps(calibration: Calibration) -> Check:
+    again = calibration.new_maps(calibration.maps.values.shape[1])
+    if again.grid != calibration.maps.grid or again.positions != calibration.maps.positions:
         return Check("maps", False, "are not of the grid and setting that this program makes")
-    off = float(np.abs(again.values - product.maps.values).max())
-    errors = np.allclose(again.errors, product.maps.errors, rtol=1e-4, atol=1e-15)  # some elements have none
+    off = float(np.abs(again.values - calibration.maps.values).max())
+    # Some elements have no error.
+    errors = np.allclose(again.errors, calibration.maps.errors, rtol=1e-4, atol=1e-15)
     text = f"differ from those of the parameters by {rounded(off, '.2g')}"
     return Check("maps", off < MAP_TOLERANCE and errors, text)
 

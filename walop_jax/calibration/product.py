@@ -7,6 +7,7 @@ otherwise 1. FITS headers and tables hold ASCII only: Greek letters and signs ar
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import re
 import tomllib
@@ -18,7 +19,13 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import UNCHECKED, Calibration, Product
+from walop_jax.calibration.calibration import (
+    UNCHECKED,
+    Calibration,
+    UnavailableInstrument,
+    Written,
+    built_model,
+)
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name, make_exposures, make_filters, make_sources
@@ -37,6 +44,8 @@ from walop_jax.io.names import PRODUCT
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.parameters import NAME, Parameter
+from walop_jax.model.specification import Model
+from walop_jax.model.standards import standards_of
 
 HASHRULE = 2
 """Rule of CONTHASH; that of earlier products, without this word, left words of the headers aside."""
@@ -91,9 +100,9 @@ class Validity(NamedTuple):
     temperature: tuple[float, float]
 
 
-def validity(product: Product) -> Validity:
+def validity(calibration: Calibration) -> Validity:
     """Dates, filters and temperatures of the exposures that a calibration was made from; NaN where none are known."""
-    e = product.exposures
+    e = calibration.exposures
     return Validity(_range(e.mjd), tuple(np.unique(e.filter).tolist()), _range(e.temp))
 
 
@@ -105,17 +114,12 @@ def _range(values: Float[np.ndarray, " e"]) -> tuple[float, float]:
 # ------------------------------------------------------------------------------------------------- writing
 
 
-def write_calibration(path: PathLike, calibration: Calibration | Product, *, overwrite: bool = False) -> None:
-    """Write a calibration, or the content of a file of one, with checksums; the file appears whole or not at all.
+def write_calibration(path: PathLike, calibration: Calibration, *, overwrite: bool = False) -> None:
+    """Write a calibration, with checksums; the file appears whole or not at all.
 
-    Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only, and for a
-    parameter whose name could not be read again.
+    Raises `DataError` if the file exists and `overwrite` is False, and if the folder is missing or read-only.
     """
-    product = calibration if isinstance(calibration, Product) else calibration.product
-    for name in product.names:
-        if not NAME.fullmatch(name):
-            raise Place(path, "PARAMETERS").fail(f"{name!r} is not a parameter name", "NAME")
-    hdus = hdus_of(product, path)
+    hdus = hdus_of(calibration, path)
     hdus[0].header["CONTHASH"] = content_of(hdus)
     with atomic_path(path, overwrite=overwrite) as temporary:
         sign_and_write(hdus, temporary)
@@ -146,7 +150,7 @@ def content_of(hdus: Iterable[Any]) -> str:
     return digest.hexdigest()
 
 
-def hdus_of(c: Product, path: object) -> list[Any]:
+def hdus_of(c: Calibration, path: object) -> list[Any]:
     """The extensions of a file, as they are written but for CONTHASH; `path` is for messages."""
     tables = {
         "PARAMETERS": _parameter_columns(c),
@@ -179,7 +183,7 @@ def hdus_of(c: Product, path: object) -> list[Any]:
     return [_primary(c), parameters, *images, filters, exposures, *hdus.values()]
 
 
-def _parameter_columns(c: Product) -> dict[str, np.ndarray]:
+def _parameter_columns(c: Calibration) -> dict[str, np.ndarray]:
     """The columns of PARAMETERS, priors NaN where there are none."""
     priors = np.array([p.prior or (np.nan, np.nan) for p in c.parameters]).reshape(-1, 2)
     return {
@@ -197,7 +201,7 @@ def _strings(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
 
 
-def _primary(c: Product) -> fits.PrimaryHDU:
+def _primary(c: Calibration) -> fits.PrimaryHDU:
     """The primary header: verdict, validity, software, content hash."""
     verdict, structure, span = c.verdict, c.verdict.structure, validity(c)
     newer = c.maps.arms != 2 or c.maps.positions or c.exposures.further or c.instrument not in shipped()
@@ -281,25 +285,21 @@ def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
 # ------------------------------------------------------------------------------------------------- reading
 
 
-def read_calibration(run: PathLike, catalogue: Sequence[EffectKind] = EFFECTS) -> Calibration:
+def read_calibration(
+    run: PathLike, catalogue: Sequence[EffectKind] = EFFECTS, *, any_model: bool = False
+) -> Calibration:
     """Read and check a calibration, given by its file or by the folder of a run.
 
-    `catalogue` are the effects that its model may have. Raises `DataError` as `read_product` does, and if the model
-    cannot be rebuilt.
+    `catalogue` are the effects that its model may have. Raises `DataError`, with advice, for a file that is damaged, of
+    another kind, from a newer version of the format, or changed since it was written; and if its model cannot be built,
+    but with `any_model`: what needs no instrument can then be asked for all the same (`Calibration.unavailable`).
     """
-    product = read_product(run)
-    with errors_naming(product.path):
-        return product.rebuilt(tuple(catalogue))
-
-
-def read_product(run: PathLike) -> Product:
-    """Read and check the product of a fit, given by its file or by the folder of a run.
-
-    Raises `DataError`, with advice, for a file that is damaged, of another kind, from a newer version of the format, or
-    changed since it was written.
-    """
-    with open_fits(product_path(run), _AGAIN) as opened:
-        return _Reader(opened).product()
+    path = product_path(run)
+    with open_fits(path, _AGAIN) as opened:
+        calibration = _Reader(opened).calibration(tuple(catalogue))
+    if calibration.unavailable is not None and not any_model:
+        raise calibration.unavailable
+    return calibration
 
 
 def product_path(run: PathLike) -> Path:
@@ -322,8 +322,11 @@ class _Reader:
                 raise fail("is there twice", file=self.path, extension=name, advice="remove one")
             self.hdus[name] = hdu
 
-    def product(self) -> Product:
-        """The contents of the file, its content hash checked."""
+    def calibration(self, catalogue: tuple[EffectKind, ...]) -> Calibration:
+        """The calibration, its content hash checked; `catalogue` are the effects that its model may have.
+
+        Parameters go by name: values and covariance are in the order of the model, as far as it can be built.
+        """
         covariance = self.image("COVARIANCE")
         maps = self.maps()
         table = self.table("PARAMETERS")
@@ -337,14 +340,33 @@ class _Reader:
         parents = zip(inputs["PATH"], inputs["SHA256"], strict=True)
         exposures, place = self.table("EXPOSURES"), Place(self.path, "EXPOSURES")
         low_x, high_x, low_y, high_y = map(self.number, _FIELD)
-        return Product(
-            instrument=instrument_name(self.header.get("INSTRUME", ""), self.primary),
-            parameters=_listed(table, model_lines),
-            maps=maps,
-            model_lines=model_lines,
-            description=tuple(description["LINE"].tolist()),
-            values=table["VALUE"],
-            covariance=covariance,
+        written = Written(maps, model_lines, tuple(description["LINE"].tolist()), self.content())
+        exposed = make_exposures(exposures, filters, site, place, kinds=None)
+        sources = Sources.none()
+        if "SOURCES" in self.hdus:
+            sources = make_sources(stars, Place(self.path, "SOURCES"), filters)
+        hidden = self.hidden(len(table["NAME"]))
+        instrument = instrument_name(self.header.get("INSTRUME", ""), self.primary)
+        names, order = table["NAME"].tolist(), np.arange(len(table["NAME"]))
+        try:
+            with errors_naming(self.path):
+                standards = standards_of(sources, exposed, filters)
+                model = built_model(instrument, written, names, standards, exposed, catalogue)
+            order = np.array([names.index(name) for name in model.names])
+        except ValueError as reason:
+            with errors_naming(self.path):
+                model = Model(
+                    instrument,
+                    UnavailableInstrument.because(reason),
+                    _listed(table, model_lines),
+                    catalogue,
+                )
+        if hidden is not None:
+            hidden = dataclasses.replace(hidden, changes=hidden.changes[:, order])
+        return Calibration(
+            model=model,
+            values=table["VALUE"][order],
+            covariance=covariance[np.ix_(order, order)],
             verdict=Verdict.recorded(
                 chi2=self.number("CHI2"),
                 dof=int(self.number("DOF")),
@@ -359,20 +381,18 @@ class _Reader:
                 structure=Structure(self.number("STRUCTG", 0.0), self.number("STRUCTR", 0.0)),
             ),
             filters=filters,
-            exposures=make_exposures(exposures, filters, site, place, kinds=None),
-            sources=make_sources(stars, Place(self.path, "SOURCES"), filters)
-            if "SOURCES" in self.hdus
-            else Sources.none(),
+            exposures=exposed,
+            sources=sources,
             site=site,
             origin=self.text("ORIGIN"),
             field=(low_x, high_x, low_y, high_y),
             inputs=tuple(InputFile(Path(path), sha256) for path, sha256 in parents),
             residuals=self.residuals(maps.arms),
-            hidden=self.hidden(len(table["NAME"])),
+            hidden=hidden,
             date=self.text("DATE"),
             versions=self.versions(),
             path=self.path,
-            content=self.content(),
+            written=written,
         )
 
     # ------------------------------------------------------------------------------------ the header
@@ -556,15 +576,20 @@ def _number(header: fits.Header, name: str, place: Place, missing: float | None 
 
 
 def _listed(table: Mapping[str, Any], model_lines: Sequence[str]) -> tuple[Parameter, ...]:
-    """The parameters of a file, with starts (NaN: unknown) and ties as far as the lines of its model contain them."""
+    """The parameters of a file, with ties as far as the lines of its model have them.
+
+    A start that neither these lines nor a prior tell is the fitted value.
+    """
     try:
         written = tomllib.loads("\n".join(model_lines)).get("parameters", {})
     except tomllib.TOMLDecodeError:
         written = {}
     parameters = []
-    for name, _, _, unit, mean, width, free in zip(*(table[n] for n in TABLES["PARAMETERS"]), strict=True):
+    for name, value, _, unit, mean, width, free in zip(
+        *(table[n] for n in TABLES["PARAMETERS"]), strict=True
+    ):
         entry, prior = written.get(name, {}), (float(mean), float(width)) if np.isfinite(width) else None
-        start = float(entry.get("start", np.nan if prior is None else mean))
+        start = float(entry.get("start", value if prior is None else mean))
         part = str(name).partition(".")[0]  # names are all that a file has
         further = {"tie": entry.get("tie"), "part": part}
         parameters.append(Parameter(str(name), str(unit), "", "", start, prior, bool(free), 1.0, **further))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.calibration.matrix import ResidualMap
@@ -17,10 +18,15 @@ def summary(
     result: FitResult,
     *,
     seconds: float,
+    accuracy: Mapping[str, Any] | None = None,
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0."""
+    """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0.
+
+    `accuracy` is how well stars are known with it (the document of `science.field_accuracy`), `misfit` where the model
+    fails, `residuals` are those over the field.
+    """
     verdict = result.checked_verdict()
     mistakes, keys = None, ("name", "size", "unit", "kind", "measured")
     if result.hidden is not None:
@@ -29,7 +35,6 @@ def summary(
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
     }
-    accuracy = result.answer() if result.answer is not None and result.converged else None
     return {
         "chi2": result.chi2,
         "dof": result.dof,
@@ -46,7 +51,7 @@ def summary(
         "warnings": list(verdict.warnings),
         "structure": dataclasses.asdict(verdict.structure),
         "hidden": mistakes,
-        "accuracy_of_p": None if accuracy is None else accuracy.document(),
+        "accuracy_of_p": accuracy,
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),
         "free_parameters": len(result.model.free),

@@ -47,33 +47,32 @@ def certify(
     """
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.certify import certify as checks_of
-    from walop_jax.calibration.product import product_path, read_calibration, read_product, validity
+    from walop_jax.calibration.product import product_path, read_calibration, validity
     from walop_jax.science.commissioning import Certificate, requirements
     from walop_jax.science.field_accuracy import field_accuracy
 
     job.tell("checking")
     source: Any = fit_of(calibration)
     held: Any = Calibration.from_fit(source) if isinstance(source, FitResult) else source
-    if in_memory := isinstance(held, Calibration):
-        path, product, catalogue = Path(IN_MEMORY), held.product, held.model.catalogue
+    if isinstance(held, Calibration):
+        path = Path(IN_MEMORY)
     else:
         path = product_path(folder_of(held))
-        product, catalogue = read_product(path), catalogue_of(effects)
+        held = read_calibration(path, catalogue_of(effects), any_model=True)
     with errors_naming(path):
-        checks = tuple(checks_of(product, catalogue))
+        checks = tuple(checks_of(held))
     needs, calset = (), None
     if any(check.name == "model" and check.passed for check in checks):
         job.tell("working out the accuracy of p")
         if isinstance(source, FitResult):
-            accuracy = field_accuracy(held) if source.answer is None else source.answer()
+            accuracy = field_accuracy(held)
             needs = requirements(source.checked_verdict(), source.minimum.message, accuracy, source.calset)
         else:
-            held = held if in_memory else read_calibration(path, catalogue)
             with contextlib.suppress(DataError):  # its exposures are looked at where they can be found
                 calset = Run(path.parent).calset if path.name == PRODUCT else None
             needs = requirements(held.verdict, "", field_accuracy(held), calset)
-    parents = tuple(entry.sha256 for entry in product.inputs)
-    certificate = Certificate(path, checks, needs, validity(product), product.content_hash(), parents)
+    parents = tuple(entry.sha256 for entry in held.inputs)
+    certificate = Certificate(path, checks, needs, validity(held), held.content_hash(), parents)
     failed = ", ".join(check.name for check in certificate.failed)
     return Outcome(
         certificate,

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, after_fit, command
-from walop_jax.commands.inputs import ModelLike, Sets, paths_of, set_and_model
+from walop_jax.commands.inputs import (
+    ModelLike,
+    Sets,
+    accuracy_document,
+    paths_of,
+    set_and_model,
+    shown_with_accuracy,
+)
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.folder import output_folder
 from walop_jax.io.names import CLIPPED, DIAGNOSIS, FIGURE_DATA, MODEL, PRODUCT, SUMMARY
@@ -94,19 +101,20 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     from walop_jax.diagnosis.findings import document
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
-    from walop_jax.science.field_accuracy import answered
+    from walop_jax.science.field_accuracy import accuracy_of_fit
 
-    product, after = found.calibration(), answered(found.after)
+    product, after = found.calibration(), found.after
     complete = found.complete
     usable, shown = after.trusted and complete, found.display()
-    if after.answer is not None and after.converged and (accuracy := after.answer()) is not None:
+    if (accuracy := accuracy_of_fit(after)) is not None:
         shown = dataclasses.replace(shown, facts=(*shown.facts, *accuracy.facts(complete=complete)))
 
     def write_summary(path: Path) -> None:
         job.tell("mapping the field", "mapping")
         misfit = None if after.explains_data else describe(after)
-        fitted = summary(after, seconds=found.seconds, misfit=misfit) | {"seed": job.seed}
-        path.write_text(json_text(fitted | {"shown": after.display().document()}), encoding="utf-8")
+        fitted = summary(after, seconds=found.seconds, accuracy=accuracy_document(accuracy), misfit=misfit)
+        shown_fit = shown_with_accuracy(after, accuracy).document()
+        path.write_text(json_text(fitted | {"seed": job.seed, "shown": shown_fit}), encoding="utf-8")
 
     return Outcome(
         found,

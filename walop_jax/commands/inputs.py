@@ -20,6 +20,8 @@ from walop_jax.io.text import json_text, read_text
 
 if TYPE_CHECKING:
     from walop_jax import Calibration, CalibrationSet, FitResult, Instrument, Model, Run
+    from walop_jax.io.display import Display
+    from walop_jax.science.field_accuracy import FieldAccuracy
 
 Sets: TypeAlias = "CalibrationSet | PathLike | Sequence[PathLike]"
 ModelLike: TypeAlias = "Model | PathLike | None"
@@ -135,6 +137,7 @@ def save(
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
+    from walop_jax.science.field_accuracy import accuracy_of_fit
 
     held = result.calibration if isinstance(result, Run) else result
     if held is None:
@@ -150,10 +153,28 @@ def save(
     ):
         write_calibration(temporary / PRODUCT, product)
         if isinstance(held, FitResult):
-            content = summary(held, seconds=held.seconds) | {"shown": held.display().document()}
+            accuracy = accuracy_of_fit(held)
+            content = summary(held, seconds=held.seconds, accuracy=accuracy_document(accuracy))
+            content["shown"] = shown_with_accuracy(held, accuracy).document()
             (temporary / SUMMARY).write_text(json_text(content), encoding="utf-8")
             if rows is not None:
                 rows.write(temporary / CLIPPED, held.calset, held.model.template.cameras.names)
+
+
+def shown_with_accuracy(result: FitResult, accuracy: FieldAccuracy | None) -> Display:
+    """What is shown of a fit, headed by how well stars are known with it."""
+    shown = result.display()
+    if accuracy is None:
+        return shown
+    # The accuracy names the mistakes that could hide with their effect on stars.
+    hidden = "" if result.hidden is None else result.hidden.in_words()
+    notes = tuple(note for note in shown.notes if note != hidden)
+    return dataclasses.replace(shown, facts=(*accuracy.facts(), *shown.facts), notes=notes)
+
+
+def accuracy_document(accuracy: FieldAccuracy | None) -> dict[str, object] | None:
+    """How well stars are known, as plain data; None where that is not known."""
+    return None if accuracy is None else accuracy.document()
 
 
 def goal_of(percent: float | None) -> float | None:

@@ -17,7 +17,15 @@ from walop_jax.commands.command import (
     typed,
     write_text,
 )
-from walop_jax.commands.inputs import ModelLike, Sets, goal_of, paths_of, set_and_model
+from walop_jax.commands.inputs import (
+    ModelLike,
+    Sets,
+    accuracy_document,
+    goal_of,
+    paths_of,
+    set_and_model,
+    shown_with_accuracy,
+)
 from walop_jax.commands.products import Effects, InstrumentLike
 from walop_jax.io.atomic import check_output
 from walop_jax.io.names import CLIPPED, FAILED, PRODUCT, SUMMARY
@@ -106,7 +114,7 @@ def refit(
     from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
     from walop_jax.fit.refit import with_honest_errors
-    from walop_jax.science.field_accuracy import answered
+    from walop_jax.science.field_accuracy import accuracy_of_fit
 
     wanted = goal_of(goal) or GOAL
     if compress is not None:
@@ -120,20 +128,29 @@ def refit(
             say(Stage("fitting without outliers", "fitting"))
             fitted = with_honest_errors(clipped(calset, chosen, clip))
         say(Stage("looking for patterns in the residuals", "examining"))
-        result = answered(examined(fitted, job.seed), goal=wanted)
+        result = examined(fitted, job.seed)
+        accuracy = accuracy_of_fit(result, wanted)
     if compress is not None and result.converged:
         write_calibration_set(compress, stand_in(result), overwrite=job.overwrite)
     mapped = output is not None and result.likelihood.layout.large and result.converged
     residuals = residual_map(result) if mapped else None
     misfit = describe(result) if output is not None and not result.explains_data else None
-    shown = dataclasses.replace(result.display(), notes=result.notes)
+    shown = shown_with_accuracy(result, accuracy)
+    # Warnings are printed apart.
+    shown = dataclasses.replace(shown, notes=tuple(n for n in shown.notes if n not in result.warnings))
     rows, cameras = result.clipped, result.model.template.cameras.names
     brief = dataclasses.replace(shown, rows=(), notes=()).text()
     judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
     options = {"instrument": instrument, "effects": effects, "elements": job.elements}
     outcome = Outcome(
         result,
-        summary(result, seconds=job.seconds, misfit=misfit, residuals=residuals),
+        summary(
+            result,
+            seconds=job.seconds,
+            accuracy=accuracy_document(accuracy),
+            misfit=misfit,
+            residuals=residuals,
+        ),
         extra={"seed": job.seed},
         display=shown,
         text=None if result.trusted else f"{brief}\n{judged}",

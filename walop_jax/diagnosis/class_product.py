@@ -16,7 +16,6 @@ Limits       to first order; different additions are taken as independent.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -127,6 +126,10 @@ class Classes(NamedTuple):
         """Those that are in the product as `Deviations`."""
         return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
 
+    def averaged(self, calibration: Calibration) -> Calibration:
+        """The calibration of a fit as the mean over these classes (the function `averaged`)."""
+        return averaged(calibration, self)
+
     def deviations(self, model: Model, context: Context) -> Deviations | None:
         """The effect that includes all that acts on stars, zero; None if nothing does."""
         described = [] if self.shape is None else [self.shape.changes[j] for j in self.shape.on_stars]
@@ -149,10 +152,7 @@ def _place(change: Sentence) -> str:
 
 def with_average(result: FitResult, classes: Classes) -> FitResult:
     """The fit whose calibration is the mean over the classes of its additions, with all that may be undetected."""
-    if not classes:
-        return result
-    mean = functools.partial(averaged, classes=classes)
-    return dataclasses.replace(result, averaged=mean, mean_of_models=classes.several)
+    return dataclasses.replace(result, alternatives=classes) if classes else result
 
 
 def averaged(calibration: Calibration, classes: Classes) -> Calibration:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -49,6 +49,19 @@ LAYOUTS = 5  # times that wavelength nodes are laid out anew for thicker retarde
 ILL_CONDITIONED = 1e6  # for each intensity: eigenvalues of data grow with their number, not those of priors
 
 
+class Alternatives(Protocol):
+    """What a diagnosis leaves open about a fit (`diagnosis.class_product.Classes`)."""
+
+    @property
+    def several(self) -> bool:
+        """True if other models explain the data as well; False if only undetected changes widen the errors."""
+        ...
+
+    def averaged(self, calibration: Any) -> Any:
+        """The calibration of the fit as the mean over all models, with their spread in its covariance."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class FitResult(Fitted):
     """A fit, the likelihood that it maximises, and the verdict on it.
@@ -56,10 +69,9 @@ class FitResult(Fitted):
     `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
     until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
     `errors_from` is the source of the covariance, the stated errors of the data (`STATED`) or residuals; `hidden`
-    are mistakes that the residuals would not show, None until these were examined. `answer` works out how well stars
-    are known with it (`science.field_accuracy.answered`), which is shown first. `averaged` makes of its calibration the
-    product of a diagnosis (`diagnosis.class_product`), `mean_of_models` if that is a mean over models that its data
-    cannot tell apart. `clipped` are the rows that it left out as outliers, None if it was not asked to
+    are mistakes that the residuals would not show, None until these were examined. `alternatives` are the other models
+    that a diagnosis could not tell apart from this one: the calibration of the fit is the mean over all of them.
+    `clipped` are the rows that it left out as outliers, None if it was not asked to
     (`outliers.clipped`).
 
     >>> result.value("pupil.magnification")[0].__round__(2)
@@ -76,9 +88,7 @@ class FitResult(Fitted):
     errors_from: str = STATED
     verdict: Verdict | None = None
     hidden: Hidden | None = None
-    answer: Callable[[], Any] | None = None
-    averaged: Callable[[Any], Any] | None = None
-    mean_of_models: bool = False
+    alternatives: Alternatives | None = None
     clipped: Clipped | None = None
 
     @classmethod
@@ -224,15 +234,14 @@ class FitResult(Fitted):
     def notes(self) -> tuple[str, ...]:
         """Notes on parameters missing in its table, on unconstrained ones, and on undetectable mistakes."""
         notes = parameter_notes(self.model, self.sigma)
-        if self.answer is not None or self.hidden is None or not len(self.hidden):
+        if self.hidden is None or not len(self.hidden):
             return notes
         return (*notes, self.hidden.in_words())
 
     def display(self) -> Display:
         """The verdict and the parameters."""
         verdict = "not examined" if self.verdict is None else self.verdict.words
-        accuracy = self.answer() if self.answer is not None and self.converged else None
-        facts = dict(accuracy.facts() if accuracy is not None else ()) | {
+        facts = {
             "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}, from {self.n_data} "
             f"intensities, {len(self.model.free)} free parameters",
             "effects": ", ".join(self.model.effect_names) or "none beyond the base model",

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration, Matrix, Product
-from walop_jax.calibration.product import read_product
+from walop_jax.calibration.calibration import Calibration, Matrix
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.clipped import read_clipped
 from walop_jax.data.records import CalibrationSet
@@ -51,20 +51,12 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     data: Sequence[str | os.PathLike[str]] = ()
 
     @functools.cached_property
-    def product(self) -> Product | None:
-        """Contents of the file of the calibration, its model not rebuilt."""
-        return read_product(self.folder) if PRODUCT in self else None
-
-    @functools.cached_property
     def calibration(self) -> Calibration | None:
-        """The calibration."""
-        if self.product is None:
-            return None
-        with errors_naming(self.folder / PRODUCT):
-            return self.product.rebuilt(tuple(self.catalogue))
+        """The calibration, also where its model cannot be built here (`Calibration.unavailable`)."""
+        return read_calibration(self.folder, self.catalogue, any_model=True) if PRODUCT in self else None
 
     @property
-    def rebuilt(self) -> Calibration:
+    def required_calibration(self) -> Calibration:
         """The calibration; `DataError` where there is none."""
         self.wanted(PRODUCT)
         assert self.calibration is not None
@@ -73,22 +65,22 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
     @property
     def model(self) -> Model:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The model that was fitted."""
-        return self.rebuilt.model
+        return self.required_calibration.model
 
     @property
     def values(self) -> Vector:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Values of all parameters."""
-        return self.rebuilt.values
+        return self.required_calibration.values
 
     @property
     def covariance(self) -> Matrix:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Covariance of all parameters."""
-        return self.rebuilt.covariance
+        return self.required_calibration.covariance
 
     @property
     def trusted(self) -> bool:
         """The verdict on the calibration."""
-        return self.rebuilt.verdict.trusted
+        return self.required_calibration.verdict.trusted
 
     @functools.cached_property
     def posterior(self) -> Any:
@@ -101,11 +93,11 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
         Raises `DataError` where the run does not name them, or they are missing or have changed.
         """
-        if self.product is None or not (inputs := self.product.inputs):
+        if self.calibration is None or not (inputs := self.calibration.inputs):
             advice = "make it with walop-jax refit"
             raise fail("does not name the data of its fit", file=self.folder, advice=advice)
         paths = self.data or [self._located(entry.path) for entry in inputs]
-        calset = read_calibration_set(*paths, kinds=self.product.design.kinds)
+        calset = read_calibration_set(*paths, kinds=self.calibration.design.kinds)
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
         if CLIPPED not in self:
@@ -136,8 +128,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         if diagnosis.get("members") or diagnosis.get("shape"):
             advice = f"fit one: walop-jax refit --model {self.folder / MODEL}, and take that run"
             raise fail(A_MEAN, file=self.folder, advice=advice)
-        calibration, calset = self.rebuilt, self.calset
-        text = "\n".join(calibration.product.model_lines) if model_text is None else model_text
+        calibration, calset = self.required_calibration, self.calset
+        text = "\n".join(calibration.model_lines) if model_text is None else model_text
         model = model_for(calset, text, calibration.design, self.catalogue)
         if Deviations.name in model.effect_names:
             model = model_without(model, Deviations.name)

@@ -187,7 +187,7 @@ def sample(
     Around a fit whose errors come from its residuals (`errors_from`), chains are those of the stated errors, and draws
     and covariance are `sandwich_adjusted`.
     """
-    if result.mean_of_models:
+    if result.alternatives is not None and result.alternatives.several:
         raise fail(A_MEAN, file="the fit", advice="fit one, refit(calset, result.model), and sample that")
     options, trusted = options or Options(), result.trusted
     report = report or (lambda progress: None)

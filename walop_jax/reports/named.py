@@ -31,7 +31,7 @@ def _accuracy(source: FigureSource) -> AnyFigure:
 
 
 def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
-    c = source.rebuilt
+    c = source.required_calibration
     if source.likelihood.layout.large:
         raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
     shown = source.likelihood, c.values, c.model.start, source.canvas
@@ -39,10 +39,11 @@ def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
 
 
 def _residual_map(source: FigureSource) -> AnyFigure:
-    if source.stored.residuals is None:
+    calibration = source.required_calibration
+    if calibration.residuals is None:
         advice = "it comes with sets of whole frames"
         raise fail("holds no map of residuals", file=source.folder, advice=advice)
-    return figures.residual_map_figure(source.stored.residuals, source.stored.design.cameras, source.canvas)
+    return figures.residual_map_figure(calibration.residuals, calibration.design.cameras, source.canvas)
 
 
 def _draws(source: FigureSource) -> tuple[Float[np.ndarray, "c d k"], tuple[str, ...], list[str]]:
@@ -93,7 +94,7 @@ def _signature(source: FigureSource) -> AnyFigure:
 
 def _cameras(source: FigureSource) -> Cameras | None:
     """Those of an instrument, which the product knows; None without one."""
-    return None if source.product is None else source.product.design.cameras
+    return None if source.calibration is None else source.calibration.design.cameras
 
 
 def _modulation(source: FigureSource) -> AnyFigure:
@@ -118,23 +119,23 @@ class NamedFigure(NamedTuple):
 
 def _small(source: FigureSource) -> bool:
     """True where there are the data of the fit, a set of points; those of whole frames have a map of residuals."""
-    return DATA in source and (source.product is None or source.product.residuals is None)
+    return DATA in source and (source.calibration is None or source.calibration.residuals is None)
 
 
 def _plates(source: FigureSource) -> list[str]:
     """Plates in the arms as figures call them."""
-    return [PLATES.get(name, name) for name in plate_names(source.stored.design)]
+    return [PLATES.get(name, name) for name in plate_names(source.required_calibration.design)]
 
 
 def _angles(fewest: int) -> Callable[[FigureSource], bool]:
     """True where a filter was seen at so many polariser angles, the calibration plate out."""
 
     def enough(source: FigureSource) -> bool:
-        product = source.product
-        e = source.calset.exposures if product is None else product.exposures
+        calibration = source.calibration
+        e = source.calset.exposures if calibration is None else calibration.exposures
         rows = e.clp_in & ~e.position(CALIBRATION_PLATE).inside
-        if product is not None:
-            rows = rows & (e.filter == product.maps.filter)
+        if calibration is not None:
+            rows = rows & (e.filter == calibration.maps.filter)
         return _small(source) and len(np.unique(np.round(e.clp_angle[rows] % 180.0, 6))) >= fewest
 
     return enough
@@ -150,9 +151,11 @@ FIGURES: Mapping[str, NamedFigure] = {
     "cross-talk": NamedFigure(
         lambda s: figures.matrix_maps_figure(s.maps, 2, s.canvas), possible=lambda s: s.maps.arms == 2
     ),
-    "retardance": NamedFigure(lambda s: paper.retardance_figure(s.rebuilt, s.canvas), possible=_plates),
+    "retardance": NamedFigure(
+        lambda s: paper.retardance_figure(s.required_calibration, s.canvas), possible=_plates
+    ),
     "retardance-wavelength": NamedFigure(
-        lambda s: paper.retardance_wavelength_figure(s.rebuilt, s.canvas), possible=_plates
+        lambda s: paper.retardance_wavelength_figure(s.required_calibration, s.canvas), possible=_plates
     ),
     "coefficients": NamedFigure(
         lambda s: paper.coefficients_figure(s.calset, s.maps.filter, s.canvas), possible=_angles(len(TERMS))
@@ -171,7 +174,9 @@ FIGURES: Mapping[str, NamedFigure] = {
     "signature": NamedFigure(_signature, FIGURE_DATA),
     "rms": NamedFigure(lambda s: diagnosis.rms_figure(s.figure_data, s.canvas), FIGURE_DATA),
     "shares": NamedFigure(lambda s: diagnosis.shares_figure(s.figure_data.shares, s.canvas), FIGURE_DATA),
-    "residual-map": NamedFigure(_residual_map, possible=lambda s: s.stored.residuals is not None),
+    "residual-map": NamedFigure(
+        _residual_map, possible=lambda s: s.required_calibration.residuals is not None
+    ),
     "residuals": NamedFigure(_residuals, possible=_small),
     "corner": NamedFigure(_corner, POSTERIOR),
     "trace": NamedFigure(_trace, POSTERIOR),
@@ -193,8 +198,8 @@ OF_RESULTS: Mapping[str, NamedFigure] = {
     "offset": NamedFigure(lambda s: paper.offset_figure(s.held[COMPARISON]), COMPARISON),
     "spectral": NamedFigure(lambda s: paper.spectral_figure(s.held[COMPARISON]), COMPARISON),
     "plate": NamedFigure(
-        lambda s: paper.plate_figure(s.rebuilt),
-        possible=lambda s: CALIBRATION_PLATE in s.rebuilt.model.template.patched().moving(),
+        lambda s: paper.plate_figure(s.required_calibration),
+        possible=lambda s: CALIBRATION_PLATE in s.required_calibration.model.template.patched().moving(),
     ),
     "tracks": NamedFigure(_tracks, SURVEY),
     "nights": NamedFigure(lambda s: survey_figures.nights_figure(s.held[SURVEY].document()), SURVEY),

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jinja2
 
 from walop_jax.calibration.accuracy import GOAL
-from walop_jax.calibration.product import read_product
+from walop_jax.calibration.product import read_calibration
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.display import Display, Displayed, signed
@@ -171,14 +171,15 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     if run.limits is not None:
         shown = run.limits.display()
         limits.append(dataclasses.replace(shown, title=f"{shown.title}: {len(run.limits.limits)} amplitudes"))
-    origin = "" if run.product is None or not run.product.origin else f"; data from {run.product.origin}"
-    sampled = run.product is not None and run.product.verdict.covariance_from == "posterior"
-    when = "" if run.product is None else run.product.date.replace("T", " at ")
+    held = run.calibration
+    origin = "" if held is None or not held.origin else f"; data from {held.origin}"
+    sampled = held is not None and held.verdict.covariance_from == "posterior"
+    when = "" if held is None else held.date.replace("T", " at ")
     date = f", {'sampled' if sampled else 'fitted'} on {when} UTC" if when else ""
     sections = (
         Section("commissioning", "Go or no-go", requirements_shown),
         Section("accuracy", "Accuracy of p over the field", pictures=error_maps),
-        Section("data", "The data", Display("", () if run.product is None else data_in_words(run.product))),
+        Section("data", "The data", Display("", () if held is None else data_in_words(held))),
         *([] if diagnosis is None else _diagnosed(run, diagnosis, head)),
         Section("residuals", "Residuals before and after", pictures=_residual_pictures(run)),
         *([] if diagnosis is None else [_candidates(run, diagnosis)]),
@@ -214,9 +215,9 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
         shown = display_of(run.commissioning, run.source.folder / COMMISSIONING)
         return shown, bool(run.commissioning["go"])
     accuracy = _accuracy(run)
-    if run.product is None or accuracy is None:
+    if run.calibration is None or accuracy is None:
         return None, True
-    checks = requirements(run.product.verdict, "", accuracy, None)
+    checks = requirements(run.calibration.verdict, "", accuracy, None)
     judged = Certificate(run.source.folder, (), checks)
     title = "Go, with reservations" if judged.missing else "Go: fit for use"
     return dataclasses.replace(judged.display(), title=title if judged.go else "No go"), judged.go
@@ -225,7 +226,7 @@ def _asked(run: RunContents) -> tuple[Display | None, bool]:
 def _accuracy(run: RunContents) -> FieldAccuracy | None:
     """The error of p over the field; None where there is none: its figure, which is missing then, says why."""
     try:
-        return None if run.product is None else run.source.accuracy
+        return None if run.calibration is None else run.source.accuracy
     except (ValueError, OSError):
         return None
 
@@ -240,9 +241,9 @@ def _with_goal(head: Display, accuracy: FieldAccuracy) -> Display:
 
 def _accuracy_pictures(run: RunContents) -> list[Picture]:
     """The error of p over the field, and the effect of a mistake that goes unnoticed."""
-    if run.product is None:
+    if run.calibration is None:
         return []
-    pictures = drawn(run.source, ["accuracy"], run.missing, filter=run.product.maps.filter)
+    pictures = drawn(run.source, ["accuracy"], run.missing, filter=run.calibration.maps.filter)
     if pictures and run.limits is not None and run.limits.worst is not None:
         pictures += drawn(run.source, ["protection"], run.missing)
     return pictures
@@ -252,7 +253,7 @@ def _residual_pictures(run: RunContents) -> list[Picture]:
     """Residuals with the starting and the final model."""
     data = run.figure_data
     if run.diagnosis is None:
-        return [] if run.product is None else drawn(run.source, ["residuals"], run.missing)
+        return [] if run.calibration is None else drawn(run.source, ["residuals"], run.missing)
     if data is None:
         return []
     overall, *steps = data.comparisons
@@ -267,10 +268,10 @@ def _residual_pictures(run: RunContents) -> list[Picture]:
 
 def _matrix_pictures(run: RunContents) -> list[Picture]:
     """Maps of the instrument matrix, of its errors, and of the residuals of whole frames."""
-    if run.product is None:
+    if run.calibration is None:
         return []
-    maps, residuals = run.product.maps, run.product.residuals
-    words = {"filter": maps.filter, "covariance": run.product.verdict.covariance_from}
+    maps, residuals = run.calibration.maps, run.calibration.residuals
+    words = {"filter": maps.filter, "covariance": run.calibration.verdict.covariance_from}
     pictures = drawn(run.source, ["matrix", "matrix-errors"], run.missing, **words)
     if residuals is not None:
         words = {"filter": residuals.filter, "significance": f"{residuals.significance():.1f}"}
@@ -337,8 +338,8 @@ def _warnings(run: RunContents) -> tuple[str, ...]:
 def _pulls(run: RunContents) -> Display:
     """The coefficients farthest from their priors, in prior widths, farthest first."""
     pulls = []
-    if run.product is not None:
-        c = run.product
+    if run.calibration is not None:
+        c = run.calibration
         for p, value, sigma in zip(c.parameters, c.values.tolist(), c.sigma.tolist(), strict=True):
             if p.free and p.tie is None and p.prior is not None and sigma > 0:
                 pulls.append(((value - p.prior[0]) / p.prior[1], p, p.prior, value, sigma))
@@ -402,7 +403,7 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
         # Further exposures of the same kind show an unknown effect again: they do not name it.
         seen = ", ".join(row["pattern"] for row in left.get("patterns", ())[:_NAMED]) or "what is left"
         steps.append((f"say what makes {seen}", f"walop-jax diagnose {sets} --effects OWN.toml -o {other}"))
-    elif run.product is None or run.product.maps.arms == 2:
+    elif run.calibration is None or run.calibration.maps.arms == 2:
         steps.append(("plan better exposures", f"walop-jax plan {name} --minutes 10"))
     return steps  # with other arms it is for the user to say which error is to be small
 
@@ -492,7 +493,7 @@ def _change_of_the_matrix(folder: Path, document: Mapping[str, Any], missing: li
         with noted(missing, "The change of the instrument matrix is not drawn: {}."):
             if old_file is None:
                 raise fail("the old calibration was in memory, not in a file")
-            old, new = (read_product(Path(path)).maps for path in (old_file, folder))
+            old, new = (read_calibration(Path(path), any_model=True).maps for path in (old_file, folder))
             pictures.append(picture("change", functools.partial(figures.matrix_change_figure, old, new)))
     return pictures
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from walop_jax.calibration.accuracy import GOAL
-from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.detection_limits import DetectionLimits
@@ -92,7 +92,7 @@ class FigureSource:
 
     def __contains__(self, name: str) -> bool:
         if self.run is not None and name == DATA:  # of a run that names its data, which a survey does not
-            return self.product is not None and bool(self.run.data or self.product.inputs)
+            return self.calibration is not None and bool(self.run.data or self.calibration.inputs)
         return name in (self.held if self.run is None else self.run)
 
     @property
@@ -111,24 +111,19 @@ class FigureSource:
         return self.held[name]
 
     @property
-    def product(self) -> Calibration | Product | None:
-        """Contents of the file of the calibration, or the calibration in memory; None without either."""
-        return self.held.get(names.PRODUCT) if self.run is None else self.run.product
+    def calibration(self) -> Calibration | None:
+        """The calibration of the run or in memory; None without either."""
+        return self.held.get(names.PRODUCT) if self.run is None else self.run.calibration
 
     @property
-    def stored(self) -> Calibration | Product:
+    def required_calibration(self) -> Calibration:
         """The same; `DataError` without one."""
-        return self._wanted(names.PRODUCT, lambda run: run.product)
-
-    @property
-    def rebuilt(self) -> Calibration:
-        """The calibration with its model."""
         return self._wanted(names.PRODUCT, lambda run: run.calibration)
 
     @property
     def maps(self) -> MatrixMaps:
         """The maps of the calibration, which need no model."""
-        return self.stored.maps
+        return self.required_calibration.maps
 
     @property
     def posterior(self) -> Any:
@@ -139,7 +134,7 @@ class FigureSource:
     def prior_width(self) -> Mapping[str, float]:
         """Widths of the priors by name, as far as they are known."""
         if self.sample is None:
-            parameters = () if self.product is None else self.product.parameters
+            parameters = () if self.calibration is None else self.calibration.parameters
             return {p.name: np.nan if p.prior is None else p.prior[1] for p in parameters}
         likelihood = self.sample.likelihood
         return {} if likelihood is None else {p.name: p.width or np.nan for p in likelihood.model.parameters}
@@ -147,7 +142,7 @@ class FigureSource:
     @functools.cached_property
     def likelihood(self) -> Likelihood:
         """The likelihood of the data under the model of the calibration."""
-        return self._wanted(DATA, lambda run: Likelihood.of(run.calset, run.rebuilt.model))
+        return self._wanted(DATA, lambda run: Likelihood.of(run.calset, run.required_calibration.model))
 
     @property
     def calset(self) -> CalibrationSet:
@@ -165,7 +160,7 @@ class FigureSource:
     @functools.cached_property
     def accuracy(self) -> FieldAccuracy | None:
         """The error of p over the field; None where one exposure holds no p."""
-        return field_accuracy(self.rebuilt, goal=self.goal)
+        return field_accuracy(self.required_calibration, goal=self.goal)
 
     @property
     def limits(self) -> DetectionLimits:
@@ -195,7 +190,7 @@ class RunContents:
 
     source: FigureSource
     summary: dict[str, Any]
-    product: Calibration | Product | None
+    calibration: Calibration | None
     diagnosis: dict[str, Any] | None
     figure_data: DiagnosisFigureData | None
     sample: dict[str, Any] | None
@@ -235,7 +230,9 @@ def read_run(run: Run | Path) -> RunContents:
         return None
 
     summary = DEFAULTS | run.document(names.SUMMARY, SUMMARY_KEYS)
-    product = optional(names.PRODUCT, lambda: run.product, "no maps of the matrix, no pulls from the priors")
+    calibration = optional(
+        names.PRODUCT, lambda: run.calibration, "no maps of the matrix, no pulls from the priors"
+    )
     diagnosis = run.document(names.DIAGNOSIS, DIAGNOSIS_KEYS) if names.DIAGNOSIS in run else None
     pictures = None
     if diagnosis is not None:
@@ -255,7 +252,7 @@ def read_run(run: Run | Path) -> RunContents:
     contents = RunContents(
         source=source,
         summary=summary,
-        product=product,
+        calibration=calibration,
         diagnosis=diagnosis,
         figure_data=pictures,
         sample=optional(
@@ -268,7 +265,7 @@ def read_run(run: Run | Path) -> RunContents:
         ),
         missing=missing,
     )
-    if product is not None and diagnosis is None:
+    if calibration is not None and diagnosis is None:
         with noted(missing, "Residuals are not drawn: {}."):
             run.calset  # noqa: B018
     return contents

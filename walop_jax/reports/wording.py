@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.calibration import Calibration, Product
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.io.text import date_of, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -39,14 +39,14 @@ _MANY = 12
 _KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standard": "of standard stars"}
 
 
-def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]:
+def data_in_words(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
-    e = product.exposures
+    e = calibration.exposures
     counts = Counter(e.kind.tolist()).items()
     kinds = ", ".join(f"{number} {_KINDS.get(kind, kind)}" for kind, number in counts)
-    low_x, high_x, low_y, high_y = product.field
+    low_x, high_x, low_y, high_y = calibration.field
     rows = [
-        ("Nights", _nights(e.mjd, product.site.longitude)),
+        ("Nights", _nights(e.mjd, calibration.site.longitude)),
         ("Exposures", f"{len(e)} ({kinds})"),
         ("Field", with_minus_sign(f"X {low_x:+.2f} to {high_x:+.2f}°, Y {low_y:+.2f} to {high_y:+.2f}°")),
         ("Polariser angles", _angles(e.clp_angle[e.clp_in])),
@@ -57,7 +57,7 @@ def data_in_words(product: Calibration | Product) -> tuple[tuple[str, str], ...]
             rows.append((name, _settings(p.angle[p.inside], bool((~p.inside).any()))))
     moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
-    standards = some([str(name) for name in product.sources.name], _MANY)
+    standards = some([str(name) for name in calibration.sources.name], _MANY)
     rows += [
         ("Moon patches", str(len(places)) if places else "none"),
         ("Standards", standards or "none"),

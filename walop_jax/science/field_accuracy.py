@@ -9,7 +9,6 @@ exactly, covariance C becomes C − C_G C_GG⁻¹ C_Gᵀ.
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -203,25 +202,12 @@ def known_in_half(error: float, goal: float = GOAL, cause: str = "") -> Requirem
     return _p_known(error, allowed, "50 % of the field", advice)
 
 
-def answered(result: FitResult, goal: float = GOAL) -> FitResult:
-    """The fit, able to say how well stars are known with it; worked out when it is first asked."""
-    return dataclasses.replace(result, answer=_Answer(result, goal))
+def accuracy_of_fit(result: FitResult, goal: float = GOAL) -> FieldAccuracy | None:
+    """How well stars are known with the calibration of a fit; None for a fit that did not converge.
 
-
-@dataclasses.dataclass
-class _Answer:
-    """The accuracy of p of a fit, worked out once; a class, so that fits can be pickled."""
-
-    result: FitResult
-    goal: float = GOAL
-
-    def __call__(self) -> FieldAccuracy | None:
-        return self.known
-
-    @functools.cached_property
-    def known(self) -> FieldAccuracy | None:
-        """See `field_accuracy`."""
-        return field_accuracy(Calibration.from_fit(self.result), goal=self.goal)
+    None as well for an instrument that is not one of two arms (`field_accuracy`).
+    """
+    return field_accuracy(Calibration.from_fit(result), goal=goal) if result.converged else None
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOAL) -> FieldAccuracy | None:
