@@ -17,11 +17,12 @@ from walop_jax.model.effects import EFFECTS, Context, EffectKind, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
+from walop_jax.model.noise import noise_choices, with_noise
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model, make_model, with_effects
 
-TABLES = ("model", "effects", "catalogue", "parameters", "law")
+TABLES = ("model", "effects", "catalogue", "noise", "parameters", "law")
 PARAMETER: Table = {
     "start": float, "prior": Any, "free": bool, "tie": str, "unit": Any, "scale": float, "about": Any,
 }  # fmt: skip
@@ -31,7 +32,8 @@ PARAMETER: Table = {
 class ModelTable:
     """The [model] table: what decides which parameters there are. None: as in the base model.
 
-    `choices` are those of effects, `entries` those of effects that do not come with the package.
+    `choices` are those of effects, `entries` those of effects that do not come with the package, `noise` the groups of
+    intensities of the terms of the errors.
     """
 
     instrument: str | None = None
@@ -40,6 +42,7 @@ class ModelTable:
     effects: tuple[str, ...] = ()
     choices: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     entries: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    noise: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def of_instrument(self) -> dict[str, Any]:
         """The choices of the base model, by name."""
@@ -57,6 +60,7 @@ def header_of(model: Model) -> ModelTable:
         effects=model.effect_names,
         choices={name: values for name, values in choices.items() if values},
         entries={effect.name: effect.entry.table for effect in model.effects if is_own(effect)},
+        noise=noise_choices(instrument),
     )
 
 
@@ -77,6 +81,8 @@ def render(model: Model) -> str:
         document["effects"] = dict(header.choices)
     if header.entries:
         document["catalogue"] = dict(header.entries)
+    if header.noise:
+        document["noise"] = dict(header.noise)
     parameters = tomlkit.table(is_super_table=True)
     for p in model.parameters:
         entry = tomlkit.table()
@@ -106,7 +112,7 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
     for key in content:
         if not isinstance(content[key], Mapping):
             raise ValueError(f"{key} = {content[key]!r} must be a table, [{key}]")
-    header = _header(*(content.get(table, {}) for table in TABLES[:3]))
+    header = _header(*(content.get(table, {}) for table in TABLES[:4]))
     model = build(header)
     if header.instrument is not None and header.instrument != model.name:
         raise ValueError(f"[model] instrument is {header.instrument}, but the data come from {model.name}")
@@ -125,7 +131,12 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
     return dataclasses.replace(model, parameters=changed, laws=laws)
 
 
-def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mapping[str, Any]) -> ModelTable:
+def _header(
+    table: Mapping[str, Any],
+    choices: Mapping[str, Any],
+    entries: Mapping[str, Any],
+    noise: Mapping[str, Any],
+) -> ModelTable:
     hints = {"instrument": str, "plates": str, "throughput_degree": int, "effects": tuple[str, ...]}
     options = Reader("").values(hints, table, "model")
     effects = options.get("effects", ())
@@ -135,7 +146,14 @@ def _header(table: Mapping[str, Any], choices: Mapping[str, Any], entries: Mappi
     for name, values in choices.items():
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    return ModelTable(**options, choices=choices, entries=entries)
+    check_names("key of [noise]", noise, ("scale", "fraction"))
+    for key, groups in noise.items():
+        if not isinstance(groups, str) and not (
+            isinstance(groups, list) and all(isinstance(group, str) for group in groups)
+        ):
+            what = 'must be "all", "camera", a KIND or a camera, or a list of these'
+            raise ValueError(f"[noise] {key} = {groups!r} {what}")
+    return ModelTable(**options, choices=choices, entries=entries, noise=noise)
 
 
 def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,13 +209,14 @@ def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]
 
 
 def with_effects_of(model: Model, header: ModelTable, context: Context) -> Model:
-    """The model with the effects of a [model] table, at its choices."""
+    """The model with the effects of a [model] table, at its choices, and the terms of the errors."""
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})
         kind = effect_by_name(name, model.catalogue)
         effects.append(kind.of(context, **choices) if choices else kind)
-    return with_effects(model, effects, context) if effects else model
+    model = with_effects(model, effects, context) if effects else model
+    return with_noise(model, **header.noise) if header.noise else model
 
 
 def effects_text(names: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import Minimum
 from walop_jax.fit.parameter_table import Fitted, parameter_notes
 from walop_jax.fit.robust import robust_errors
-from walop_jax.fit.search import find_minimum
+from walop_jax.fit.search import find_minimum, with_errors_fitted
 from walop_jax.fit.verdict import (
     NO_STRUCTURE,
     STATED,
@@ -278,13 +278,18 @@ def fit(
     """
     began = time.perf_counter()
     first = _start(likelihood) if start is None else np.asarray(start, float)
+    # Where errors of the data have parameters, the instrument is sought first, with errors held.
+    likelihood = likelihood.with_errors_at(first)
     best = find_minimum(likelihood, first, noise_scale, worth)
     for _ in range(LAYOUTS):
         # Retarders that a fit has made thicker need more wavelengths than those that it began with.
         before, likelihood = likelihood, likelihood.following(best.x)
         if likelihood is before:
             break
+        likelihood = likelihood.with_errors_at(first)
         best = find_minimum(likelihood, best.x, noise_scale, worth)
+    if likelihood.model.template.noise is not None:
+        best = with_errors_fitted(likelihood, best, first, noise_scale or 1.0)
     return fit_at(likelihood, best, time.perf_counter() - began)
 
 
@@ -299,7 +304,7 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
         them = "it" if len(idle) == 1 else "them"
         raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
     return FitResult(
-        likelihood=likelihood,
+        likelihood=likelihood.with_errors_at(best.x),
         values=best.x,
         covariance=covariance(model, best.expansion),
         expansion=best.expansion,

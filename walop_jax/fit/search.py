@@ -20,6 +20,7 @@ from walop_jax.likelihood.frames import expand_pixels, stands_for_pixels, strips
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.model import materials
+from walop_jax.model.noise import NOISE
 from walop_jax.model.specification import Model, Vector
 
 FIRST_STRIPS = 8
@@ -95,6 +96,32 @@ def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
     return _search(likelihood, "closer to the data", values, 1.0, **how).x
 
 
+def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise_scale: float) -> Found:
+    """The minimum in the parameters of the errors as well, from that with errors held at the start values `first`.
+
+    Scales begin where they would make χ²/dof of the residuals 1.
+    """
+    model, expansion, start = likelihood.model, best.expansion, best.x.copy()
+    at = model.positions(NOISE)
+    start[at] = first[at]
+    for i in at:
+        if model.names[i].startswith("noise.scale") and model.parameters[i].free:
+            start[i] *= np.sqrt(expansion.misfit)
+    rows, select = likelihood.priors, model.selection()
+    known = np.zeros((len(first), len(first)))
+    known[rows.index, rows.index] = rows.width**-2
+    of_data = expansion.matrix - select.T @ known @ select
+    unit = free_scales(model)
+    inverse = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), rcond=1e-15, hermitian=True)
+    taken_up = float(np.sum(inverse * of_data * np.outer(unit, unit)))
+    data = float(expansion.census.rows @ likelihood.data_per_row)
+    live = dataclasses.replace(likelihood.with_errors_at(None), left=1.0 - taken_up / max(data, 1.0))
+    found = _search(
+        live, "fit with errors of the data", model.full(start[model.free], start), noise_scale, expansion
+    )
+    return dataclasses.replace(found, starts=best.starts, steps=best.steps + found.steps)
+
+
 def find_minimum(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
 ) -> Found:
@@ -111,6 +138,7 @@ def find_minimum(
     points = PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
     sample_set, runner = thinned(likelihood.calset, points), likelihood.runner
     sample = Likelihood.of(sample_set, likelihood.model, memory=layout.allowed, runner=runner)
+    sample = sample.with_errors_at(likelihood.errors_at)
     best = find_minimum(sample, first, noise_scale, worth)
     scale, starts = best.expansion.noise_scale, best.starts
     stride = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0

@@ -22,8 +22,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 
-def _namespace(array: Any) -> ModuleType:
-    return jnp if isinstance(array, jax.Array) else np
+def namespace(*arrays: Any) -> ModuleType:
+    """`jax.numpy` if one of the arrays is one of JAX, else `numpy`: arrays of numpy stay so."""
+    return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
 class Sharing(NamedTuple):
@@ -47,7 +48,7 @@ class Sharing(NamedTuple):
         by_camera = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
         if self.exposures is None:
             return by_camera
-        xp = _namespace(values)
+        xp = namespace(values)
         groups = xp.einsum("...ek,es->...sk", by_camera, self.exposures)
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
 
@@ -55,7 +56,7 @@ class Sharing(NamedTuple):
         """Weighted residuals or derivatives, the flux eliminated, with errors that are independent; or back."""
         if self.stars is None:
             return values
-        xp = _namespace(values)
+        xp = namespace(values)
         *lead, exposures, cameras, directions = self.stars.shape
         stars = xp.asarray(self.stars).reshape(*lead, exposures * cameras, directions)
         back = xp.swapaxes(stars, -2, -1)
@@ -76,7 +77,7 @@ def eliminate_flux(
     shared: Sharing = ALONE,
 ) -> tuple[Float[Any, "... f"], Float[Any, "... k"]]:
     """Best flux of every exposure and the normalised residuals data − model; f as in `Sharing.summed`."""
-    xp = _namespace(weighted_model)
+    xp = namespace(weighted_model)
     power = shared.summed(weighted_model**2)
     best = shared.summed(weighted_counts * weighted_model) / xp.where(power > 0, power, 1.0)
     flux = xp.where(xp.asarray(flux_known)[..., None], 1.0, best)
@@ -94,7 +95,7 @@ def project_flux(
     `along` is the derivative with respect to the flux; it and `flux_known` broadcast against the columns. Arrays of
     numpy stay so.
     """
-    xp = _namespace(columns)
+    xp = namespace(columns)
     power = shared.summed(along**2)
     share = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
     return shared.independent(columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along)

@@ -2,6 +2,8 @@
 
     χ²(θ) = Σ ((N − F a(θ)) / σ)²,    ln L = −χ² / 2,    ln p = −½ Σ ((θ − μ) / s)²
 
+Where the errors σ have parameters, ln L has the other terms of `likelihood/noise.py` as well.
+
 Symbols     θ parameters of the model, in its order and units; N ± σ used intensities (electrons); a(θ) counts for light
             of unit flux (`model.light`), through the detectors where their response is not linear; F flux of each
             (point, exposure), the one that fits best (`likelihood.flux`); μ, s mean and width of a prior
@@ -33,6 +35,7 @@ from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.engine import PointData
 from walop_jax.likelihood.layout import Layout, PointReader
 from walop_jax.likelihood.likelihood import PriorRows, prior_rows
+from walop_jax.likelihood.noise import NoiseTerms, log_variance, variance_ratio
 from walop_jax.model.compiled import array, need_float64
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, values_of, with_values
@@ -97,6 +100,7 @@ class Forward(eqx.Module):
     free: Int[Array, " f"]
     start: Values
     prior: tuple[Int[Array, " k"], Float[Array, " k"], Float[Array, " k"]]
+    noise_terms: NoiseTerms | None
     names: tuple[str, ...] = eqx.field(static=True)
     shape: tuple[int, int, int] = eqx.field(static=True)
 
@@ -124,6 +128,7 @@ class Forward(eqx.Module):
             free=array(model.free),
             start=array(model.start),
             prior=(array(rows.index), array(rows.mean), array(rows.width)),
+            noise_terms=None if model.template.noise is None else NoiseTerms(*map(array, reader.noise_terms)),
             names=model.names,
             shape=(layout.points, len(calset.exposures), calset.cameras),
         )
@@ -188,7 +193,8 @@ class Forward(eqx.Module):
 
         def of(point: PointData, flux: Array | None) -> Array:
             instrument, unit = self._unit(values, point)
-            flux = engine.best_flux(instrument, self.plan, unit, point) if flux is None else flux
+            if flux is None:
+                flux = engine.best_flux(instrument, self.plan, unit, self._with_errors(instrument, point)[0])
             return engine.real_counts(instrument, self.plan, unit, flux, point)
 
         return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, flux)))
@@ -199,7 +205,7 @@ class Forward(eqx.Module):
 
         def of(point: PointData) -> Array:
             instrument, unit = self._unit(values, point)
-            return engine.best_flux(instrument, self.plan, unit, point)
+            return engine.best_flux(instrument, self.plan, unit, self._with_errors(instrument, point)[0])
 
         return self._whole(jax.lax.map(jax.vmap(of), self.data))
 
@@ -217,9 +223,21 @@ class Forward(eqx.Module):
         return engine.summed(lambda data: _chi2(dataclasses.replace(self, data=data), values), self.data)
 
     @program
+    def log_variance(self, values: Values | Instrument) -> Float[Array, ""]:
+        """What −2 ln L has beside χ² where errors of the data have parameters; 0 where they are as stated."""
+        if self.noise_terms is None:
+            return jnp.zeros(())
+        return engine.summed(lambda data: self._log_variance(values, data), self.data)
+
+    @program
     def log_likelihood(self, values: Values | Instrument) -> Float[Array, ""]:
-        """−χ²/2 of the data."""
-        return -0.5 * self.chi2(values)
+        """−χ²/2 of the data; with the other terms of the density where their errors have parameters."""
+        if self.noise_terms is None:
+            return -0.5 * self.chi2(values)
+        deviance = engine.summed(
+            lambda data: _deviance(dataclasses.replace(self, data=data), values), self.data
+        )
+        return -0.5 * deviance
 
     @program
     def log_prior(self, values: Values) -> Float[Array, ""]:
@@ -249,9 +267,29 @@ class Forward(eqx.Module):
     def _residuals(self, values: Values | Instrument, data: PointData) -> Float[Array, "m e k"]:
         def of(point: PointData) -> Array:
             instrument, unit = self._unit(values, point)
-            return engine.residuals_of(instrument, self.plan, unit, point)[1]
+            return engine.residuals_of(instrument, self.plan, unit, self._with_errors(instrument, point)[0])[
+                1
+            ]
 
         return jax.vmap(of)(data)
+
+    def _with_errors(self, instrument: Instrument, point: PointData) -> tuple[PointData, Float[Any, "e k"]]:
+        """A point with the errors of the noise terms of an instrument, and σ²/N_ERR² of its intensities."""
+        if instrument.noise is None or self.noise_terms is None:
+            return point, jnp.ones_like(point.weight)
+        ratio = variance_ratio(instrument.noise, self.noise_terms, point.counts, point.weight)
+        return point._replace(weight=point.weight / jnp.sqrt(ratio)), ratio
+
+    def _log_variance(self, values: Values | Instrument, data: PointData) -> Float[Array, ""]:
+        """Sum over the points of a batch."""
+
+        def of(point: PointData) -> Array:
+            instrument, unit = self._unit(values, point)
+            point, ratio = self._with_errors(instrument, point)
+            shared = engine.sharing(instrument, self.plan)
+            return log_variance(ratio, unit * point.weight, self.plan.exposures.flux_known, shared)
+
+        return jnp.sum(jax.vmap(of)(data))
 
     def _whole(self, batches: Float[Array, "c m e k"]) -> Float[Array, "p e k"]:
         """All points, without those that fill up the last batch."""
@@ -263,26 +301,39 @@ class Forward(eqx.Module):
         return filled.reshape(batches, size, *points.shape[1:])
 
 
-@jax.custom_jvp
+def _with_its_gradient(function: Callable[[Forward, Any], Array]) -> Callable[[Forward, Any], Array]:
+    """The function of a batch and of values, made together with its gradient where it is differentiated.
+
+    The gradient comes by reverse differentiation, and nothing is computed twice.
+    """
+    made = jax.custom_jvp(function)
+
+    def with_gradient(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+        leaves, tree = jax.tree.flatten(primals)
+        steps = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+        moving = [n for n, step in enumerate(steps) if not isinstance(step, SymbolicZero)]
+
+        def value_at(moved: list[Array]) -> Array:
+            at = dict(zip(moving, moved, strict=True))
+            return function(*tree.unflatten([at.get(n, leaf) for n, leaf in enumerate(leaves)]))
+
+        # Another reverse pass, for second derivatives, keeps the inputs of a batch alone.
+        value, gradient = jax.checkpoint(jax.value_and_grad(value_at))([leaves[n] for n in moving])
+        changes = [jnp.vdot(slope, steps[n]) for n, slope in zip(moving, gradient, strict=True)]
+        return value, sum(changes, jnp.zeros_like(value))
+
+    made.defjvp(with_gradient, symbolic_zeros=True)
+    return made
+
+
+@_with_its_gradient
 def _chi2(batch: Forward, values: Values | Instrument) -> Float[Array, ""]:
     """χ² of the points of a batch."""
     return jnp.sum(batch._residuals(values, batch.data) ** 2)
 
 
-def _with_gradient(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    """χ² and its change: the gradient is made with it, by reverse differentiation, and nothing is computed twice."""
-    leaves, tree = jax.tree.flatten(primals)
-    steps = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
-    moving = [n for n, step in enumerate(steps) if not isinstance(step, SymbolicZero)]
-
-    def chi2(moved: list[Array]) -> Array:
-        at = dict(zip(moving, moved, strict=True))
-        return _chi2.fun(*tree.unflatten([at.get(n, leaf) for n, leaf in enumerate(leaves)]))
-
-    # Another reverse pass, for second derivatives, keeps the inputs of a batch alone.
-    value, gradient = jax.checkpoint(jax.value_and_grad(chi2))([leaves[n] for n in moving])
-    changes = [jnp.vdot(slope, steps[n]) for n, slope in zip(moving, gradient, strict=True)]
-    return value, sum(changes, jnp.zeros_like(value))
-
-
-_chi2.defjvp(_with_gradient, symbolic_zeros=True)
+@_with_its_gradient
+def _deviance(batch: Forward, values: Values | Instrument) -> Float[Array, ""]:
+    """−2 ln L of the points of a batch."""
+    chi2 = jnp.sum(batch._residuals(values, batch.data) ** 2)
+    return chi2 + batch._log_variance(values, batch.data)

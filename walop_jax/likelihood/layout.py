@@ -31,6 +31,7 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import PointData, sharing, star_responses
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import of_low_rank
+from walop_jax.likelihood.noise import NoiseTerms, variance_ratio
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.chebyshev import Rectangle
@@ -38,6 +39,7 @@ from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.noise import Noise
 from walop_jax.model.parameters import values_of
 from walop_jax.model.plan import Plan, with_median
 from walop_jax.model.planning import outgrown, plan_for
@@ -263,13 +265,15 @@ class PointReader:
     """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
 
     No error is taken to be smaller than a share of the mean counts of its row (`Cameras.floor`); `instrument` gives
-    that, and how stars of a field that differ look in the cameras.
+    that, and how stars of a field that differ look in the cameras. `noise` are terms of the errors at known values: the
+    errors are those that the terms make of the stated ones; None: the stated ones.
     """
 
     calset: CalibrationSet
     plan: Plan
     instrument: Instrument
     mirrored: bool = False
+    noise: Noise | None = None
 
     def batches(self, start: int, stop: int, size: int) -> list[PointData]:
         """The points `start:stop` in batches of `size`, the last one filled up with its last point, of weight 0."""
@@ -287,6 +291,8 @@ class PointReader:
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
         sigma = with_floor(block.sigma, block.counts, self._floor())
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
+        if self.noise is not None:
+            weight = weight / np.sqrt(variance_ratio(self.noise, self.noise_terms, block.counts, weight))
         data = PointData(
             x=array(block.x),
             y=array(block.y),
@@ -299,6 +305,12 @@ class PointReader:
         )
         fields = fields_of_stars(self.calset.sources)
         return data._replace(stars=array(self._stars(data, fields))) if len(fields) else data
+
+    @cached_property
+    def noise_terms(self) -> NoiseTerms:
+        """Which intensities each term of the errors concerns; no terms where the instrument has none."""
+        noise = self.instrument.noise or Noise.of()
+        return NoiseTerms.of(noise, self.calset.exposures.kind.tolist(), self.instrument.cameras.names)
 
     def _floor(self) -> float | Float[np.ndarray, "e 1"]:
         """`Cameras.floor`, in each exposure: where points stand for pixels, it has counted for each of these."""

@@ -24,10 +24,13 @@ from walop_jax.likelihood.layout import (
     fields_of_stars,
     planned_instrument,
 )
+from walop_jax.likelihood.noise import noise_expansion, variance_ratio
 from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner
+from walop_jax.model.compiled import array
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.noise import NOISE
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import outgrown
 from walop_jax.model.specification import Model
@@ -55,17 +58,23 @@ class Census(NamedTuple):
 
 
 class DataTerms(NamedTuple):
-    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census."""
+    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census.
+
+    Where errors of the data have parameters, `log_variance` is the rest of −2 ln L (`noise.log_variance`), and gradient
+    and matrix hold its part.
+    """
 
     data: float
     gradient: Vector
     matrix: Matrix
     census: Census
+    log_variance: float = 0.0
 
     def joined(self, other: DataTerms) -> DataTerms:
         """The terms of two parts of a set."""
         a, b, census = self, other, self.census.joined(other.census)
-        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census)
+        log_variance = a.log_variance + b.log_variance
+        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census, log_variance)
 
 
 Joined = TypeVar("Joined", Census, DataTerms)
@@ -85,8 +94,9 @@ class Expansion:
     `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
     errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
     share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
-    `chi2`. `dof` counts the independent data of every used row (`Likelihood.data_per_row`), one per prior, less the
-    parameters that these determine (`determined`).
+    `chi2`. `log_variance` is what −2 ln L has beside `chi2` where errors of the data have parameters (χ² is with the
+    errors that these make), 0 where all errors are as stated. `dof` counts the independent data of every used row
+    (`Likelihood.data_per_row`), one per prior, less the parameters that these determine (`determined`).
     """
 
     data: float
@@ -98,6 +108,7 @@ class Expansion:
     census: Census
     dof: int
     optics: OpticsUsed
+    log_variance: float = dataclasses.field(default=0.0, kw_only=True)
 
     @property
     def chi2(self) -> float:
@@ -112,7 +123,7 @@ class Expansion:
     @property
     def objective(self) -> float:
         """Number that a fit minimises."""
-        return self.data / self.noise_scale**2 + self.priors + self.loose
+        return self.data / self.noise_scale**2 + self.log_variance + self.priors + self.loose
 
     @property
     def n_data(self) -> int:
@@ -169,6 +180,10 @@ class Likelihood:
     and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
     finds out beside its sums comes back with them (`Expansion`).
 
+    Errors of the data that have parameters (`model.noise`) are those of the values that a method is given, unless
+    `errors_at` says at which values (a full vector) they are held: a fit hands on its likelihood with errors as fitted.
+    `left` is the fraction of the data that the other parameters leave for the errors (`noise`).
+
     >>> values, residual = result.likelihood.residuals(result.values)
     >>> residual.shape  # point, exposure, camera
     (29, 14, 4)
@@ -178,6 +193,8 @@ class Likelihood:
     points: MeasuredPoints
     runner: Runner
     model: Model
+    errors_at: Vector | None = None
+    left: float = 1.0
 
     def __repr__(self) -> str:
         names, free = len(self.model.names), len(self.model.free)
@@ -214,6 +231,22 @@ class Likelihood:
         model, layout = dataclasses.replace(self.model, template=instrument), self.layout
         how = {"memory": layout.allowed, "interpolate": layout.interpolated, "sets": layout.sets}
         return Likelihood.of(self.calset, model, runner=self.runner, **how)
+
+    def with_errors_at(self, values: Vector | None) -> Likelihood:
+        """The same with errors of the data held at a full vector of values; None: at those of each call.
+
+        Itself where the errors have no parameters.
+        """
+        if self.model.template.noise is None:
+            return self
+        noise = None if values is None else self.model.instrument(np.asarray(values, float)).noise
+        reader = dataclasses.replace(self.points.reader, noise=noise)
+        return dataclasses.replace(self, points=MeasuredPoints(reader, self.layout), errors_at=values)
+
+    @property
+    def fits_errors(self) -> bool:
+        """True where errors of the data depend on the values that a method is given."""
+        return self.model.template.noise is not None and self.errors_at is None
 
     @property
     def calset(self) -> CalibrationSet:
@@ -293,10 +326,32 @@ class Likelihood:
         nodes, optics = self.nodes(instrument, near)
 
         def of_batch(data: engine.PointData) -> DataTerms:
+            if self.fits_errors:
+                return self._terms_with_errors(instrument, data, nodes)
             chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
             return DataTerms(float(chi2), gradient, matrix, self._counted(data))
 
         return self._joined("χ², gradient and matrix", of_batch), optics
+
+    def _terms_with_errors(
+        self, instrument: Instrument, stated: engine.PointData, nodes: FieldTable | None
+    ) -> DataTerms:
+        """Terms of a batch of the data whose errors are those of the noise terms of the instrument."""
+        noise, groups = instrument.noise, self.points.reader.noise_terms
+        assert noise is not None
+        counts, weight = np.asarray(stated.counts), np.asarray(stated.weight)
+        ratio = variance_ratio(noise, groups, counts, weight)
+        data = stated._replace(weight=array(weight / np.sqrt(ratio)))
+        chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
+        residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
+        shared = engine.sharing(instrument, self.plan)
+        of_errors = noise_expansion(
+            noise, groups, counts, weight, residual, self.flux_known, shared, self.left
+        )
+        at, gradient, matrix = self.model.positions(NOISE), np.array(gradient), np.array(matrix)
+        gradient[at] += of_errors.gradient
+        matrix[np.ix_(at, at)] += of_errors.matrix
+        return DataTerms(float(chi2), gradient, matrix, self._counted(data), of_errors.value)
 
     def expanded(self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed) -> Expansion:
         """The expansion from the terms of the data."""
@@ -306,6 +361,9 @@ class Likelihood:
         matrix = terms.matrix / noise_scale**2
         matrix[rows.index, rows.index] += rows.width**-2
         matrix = select.T @ matrix @ select
+        # Parameters of the errors take up no data: with their best values χ² is its expectation.
+        of_model = ~np.isin(self.model.free, self.model.positions(NOISE))
+        taken_up = determined(matrix[np.ix_(of_model, of_model)], self.weak[of_model])
         return Expansion(
             data=terms.data,
             priors=float(np.sum(pull[rows.known] ** 2)),
@@ -314,12 +372,14 @@ class Likelihood:
             gradient=select.T @ gradient,
             matrix=matrix,
             census=terms.census,
-            dof=self._independent(terms.census) - round(determined(matrix, self.weak)),
+            dof=self._independent(terms.census) - round(taken_up),
             optics=optics,
+            log_variance=terms.log_variance,
         )
 
     def _independent(self, census: Census) -> int:
-        return round(float(census.rows @ self.data_per_row)) + int(self.priors.known.sum())
+        of_errors = np.isin(self.priors.index, self.model.positions(NOISE))
+        return round(float(census.rows @ self.data_per_row)) + int((self.priors.known & ~of_errors).sum())
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
@@ -360,8 +420,11 @@ class Likelihood:
     def residuals(self, values: Vector) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
-        The flux is the mean over the arms where each has its own. For whole frames take a sample (`layout.thinned`).
+        The flux is the mean over the arms where each has its own; errors that have parameters are those of `values`.
+        For whole frames take a sample (`layout.thinned`).
         """
+        if self.fits_errors:
+            return self.with_errors_at(values).residuals(values)
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
@@ -373,6 +436,8 @@ class Likelihood:
 
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
+        if self.fits_errors:
+            return self.with_errors_at(values).jacobian(values)
         instrument, select = self.model.instrument(values), self.model.selection()
         slopes = ((engine.linearised_residuals(instrument, self.plan, c)[1], c) for c in self.points)
         return np.concatenate([used_rows(slope, batch) @ select for slope, batch in slopes])

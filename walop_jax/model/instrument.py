@@ -32,13 +32,14 @@ from walop_jax.model.elements.base import Element
 from walop_jax.model.elements.simple import Analyser, Polariser
 from walop_jax.model.elements.wave_plate import MODELS, WavePlate
 from walop_jax.model.light_path import Arm, LightPath
+from walop_jax.model.noise import Noise
 from walop_jax.model.parameters import check_names, leaves
 from walop_jax.model.ray import Conditions, Ray
 from walop_jax.model.sources import SOURCES, Source, Standards
 
 PLATE_MODELS = tuple(MODELS)
 STAR = tuple[str, float, float]
-TAKEN = ("throughput", "cameras", "effects")
+TAKEN = ("throughput", "cameras", "effects", "noise")
 """Names of other parts of an instrument."""
 
 NAN = float("nan")
@@ -51,7 +52,8 @@ class Instrument(LightPath):
     Field coordinates reach to ±`field_limit` (deg); `site` is telescope, latitude and longitude (deg, east positive),
     elevation (m) and MJD of a full Moon, `raster` the arrangement of the points of a simulated run and its half width
     (deg). `description` is the text of its description, empty for a shipped instrument, `source` the origin of its
-    numbers; colours and fringes are relative to `wavelength` (µm).
+    numbers; colours and fringes are relative to `wavelength` (µm). `noise` are the terms of the errors of its data that
+    a fit finds; None: the errors are as stated.
 
     >>> walop.Instrument.read("WALOP-NORTH").cameras.names
     ('O1', 'E1', 'O2', 'E2')
@@ -63,6 +65,7 @@ class Instrument(LightPath):
     description: str = eqx.field(static=True, default="", repr=False)
     source: str = eqx.field(static=True, default="", repr=False)
     wavelength: float = eqx.field(static=True, default=REFERENCE_WAVELENGTH)
+    noise: Noise | None = None
 
     def __repr__(self) -> str:
         arms = "; ".join(f"{arm.name}: {' > '.join(arm.path)}" for arm in self.arms)
@@ -183,8 +186,8 @@ def adapted(
 
 
 def as_designed(instrument: Instrument) -> Instrument:
-    """The instrument without effects: they are added by name."""
-    return dataclasses.replace(instrument, effects=())
+    """The instrument without effects and terms of the errors: models add them."""
+    return dataclasses.replace(instrument, effects=(), noise=None)
 
 
 def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
