@@ -51,6 +51,7 @@ from walop_jax.model.effects import Effect as Effect
 from walop_jax.model.effects import effect_by_name as effect_by_name
 from walop_jax.model.elements.base import Element as Element
 from walop_jax.model.instrument import Instrument as Instrument
+from walop_jax.model.noise import with_noise as with_noise
 from walop_jax.model.parameters import Scalar as Scalar
 from walop_jax.model.parameters import number as number
 from walop_jax.model.parameters import param as param

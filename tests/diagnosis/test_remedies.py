@@ -32,9 +32,10 @@ def test_scintillation_is_an_error_of_the_errors():
     """0.4 % of every intensity beyond the noise of its photons: bright cameras scatter more, and nothing is missing."""
     calset = small_fit().calset
     first = judged(scattered(calset, 0.004 * block_of(calset).counts)).warnings[0]
-    share = re.search(r"N_ERR lacks ([\d.]+) % of N", first)
+    share = re.search(r"N_ERR lacks ([\d.]+) ± ([\d.]+) % of N", first)
     assert share is not None
-    assert float(share[1]) == pytest.approx(0.4, rel=0.1)
+    assert float(share[1]) == pytest.approx(0.4, abs=4 * float(share[2]))
+    assert 0.002 < float(share[2]) < 0.02
     assert "times too small" not in first
     assert "diagnose" not in first
 
@@ -42,7 +43,10 @@ def test_scintillation_is_an_error_of_the_errors():
 def test_errors_that_are_too_small_by_a_factor_are_told_as_such():
     calset = small_fit().calset
     first = judged(scattered(calset, np.sqrt(3.0) * block_of(calset).sigma)).warnings[0]
-    assert re.search(r"N_ERR is (1\.9\d?|2|2\.0\d) times too small", first)
+    told = re.search(r"N_ERR is ([\d.]+) ± ([\d.]+) times too small", first)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(2.0, abs=4 * float(told[2]))
+    assert float(told[2]) == pytest.approx(2.0 / np.sqrt(2.0 * small_fit().dof), rel=0.1)
     assert "diagnose" not in first
 
 

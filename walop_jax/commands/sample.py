@@ -34,7 +34,6 @@ OPTIONS = {
         "Calibration set of the fit, if it has moved; again for each.", metavar="CALSET", kind=list[Path]
     ),
     "sampler": Option("emcee, nuts, or your own as FILE.py:CLASS.", metavar="NAME", kind=str),
-    "inflate": Option("Sample a factor on the errors of the data."),
     "maximum_steps": Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1),
     "walkers": Option("Walkers of an emcee ensemble; 0: at least 64.", least=0),
     "interval": Option("Steps after which convergence is judged and the chain kept.", least=1),
@@ -52,7 +51,6 @@ def sample(
     data: Sequence[PathLike] | None = None,
     effects: Effects = None,
     sampler: Any = "emcee",
-    inflate: bool = False,
     maximum_steps: int = 100_000,
     walkers: int = 0,
     interval: int = 500,
@@ -78,7 +76,7 @@ def sample(
 
     shown = None if parameters is None else tuple(parameters)
     options = options or Options(
-        sampler, job.seed, walkers, interval, maximum_steps, moves=moves, inflate=inflate, parameters=shown
+        sampler, job.seed, walkers, interval, maximum_steps, moves=moves, parameters=shown
     )
 
     def tell(progress: Progress) -> None:

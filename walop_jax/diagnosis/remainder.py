@@ -184,8 +184,12 @@ def _unexplained(evidence: Examination) -> Unexplained:
     cameras = evidence.result.model.template.cameras.names
     patterns = tuple((pattern_in_words(name, cameras), p) for name, p in evidence.beside_patterns[0])
     if not evidence.alarm:
-        ratio = evidence.chi2 / evidence.dof
-        text = f"residuals scatter more than N_ERR (χ²/dof = {ratio:.3g}) without a known pattern"
+        factor = np.sqrt(evidence.chi2 / evidence.dof)
+        size = with_error(factor, factor / np.sqrt(2.0 * evidence.dof))
+        text = (
+            f"residuals scatter {size} times as much as N_ERR without a known pattern: N_ERR is too small, or"
+        )
+        text += ' has no scintillation ([noise] scale = "all", or fraction = "all", in a model file has it fitted)'
     elif patterns:
         text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:

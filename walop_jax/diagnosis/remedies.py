@@ -1,7 +1,7 @@
 """What would repair a fit that does not explain its data: every remedy is fitted, the one that repairs most is first.
 
-Remedies    errors N_ERR that are too small, by a factor s or by a share f of the counts (scintillation, a flat field):
-                s² N_ERR²   or   N_ERR² + f² N²,   with s or f so that χ² is its expectation
+Remedies    errors N_ERR that are too small, by a scale s or a fraction f of the counts (scintillation, a flat field):
+                s² N_ERR²   or   N_ERR² + f² N²,   s or f fitted together with the model (`model.noise`)
             single rows left out (`fit.outliers`); a number that the set states changed (`stated_conditions`)
             A remedy is one if what it leaves is noise: χ², and of errors no pattern, component or odd group.
 Order       −2 ln L = χ² + Σ ln (σ²/N_ERR²), the smallest first; a row left out counts as a number fitted to each
@@ -11,14 +11,11 @@ Limits      one remedy at a time. Where none is one, an effect may be missing, a
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
 
-from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
@@ -27,10 +24,12 @@ from walop_jax.diagnosis.stated_conditions import condition_scores
 from walop_jax.fit.outliers import BEYOND, MOST, clipped, outlying
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.errors import DataError
+from walop_jax.io.text import with_error
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.noise import with_noise
 
-_ROUNDS = 3  # fits in which a share of the counts is determined
-_LARGEST_SHARE = 0.3
+_LARGEST_FRACTION = 0.3
+"""Of the counts: what would have to be added beyond it is no error of an intensity."""
 
 
 class Remedy(NamedTuple):
@@ -56,65 +55,39 @@ def remedies(result: FitResult, is_noise: Judge) -> tuple[str, ...]:
 
 
 def _of_errors(result: FitResult, is_noise: Judge) -> Iterator[Remedy]:
-    factor = float(np.sqrt(result.chi2 / max(result.dof, 1)))
-    scaled = fit(result.likelihood, start=result.values, noise_scale=factor)
-    if is_noise(scaled):
-        yield Remedy(
-            _too_small(factor), scaled.chi2 / factor**2 + 2.0 * result.dof * np.log(factor) - result.dof
-        )
-    table = result.calset.intensities
-    if not isinstance(table, TableIntensities):
-        return
-    share, other = 0.0, result
-    calset = result.calset
-    for _ in range(_ROUNDS):
-        share = _share(other, result.calset, share)
-        if not 0.0 < share < _LARGEST_SHARE:
-            return
-        calset = _with_share(result.calset, share)
-        other = fit(Likelihood.of(calset, result.model), start=other.values, noise_scale=1.0)
-    if other.explains_data and is_noise(other):
-        block = result.calset.intensities.block(0, len(result.calset.points))
-        counts, sigma = (c[block.used] for c in (block.counts, block.sigma))
-        # Of a row with a flux of its own one datum in K is not independent.
-        weight = result.dof / max(result.n_data, 1)
-        wider = weight * float(np.sum(np.log1p((share * counts / sigma) ** 2)))
-        yield Remedy(
-            f"N_ERR lacks {100 * share:.2g} % of N: with √(N_ERR² + ({share:.2g} N)²) the residuals hold nothing but "
-            "noise; that is scintillation, or a flat field that is left, and belongs into N_ERR",
-            other.chi2 + wider - result.dof,
-        )
+    """The errors of the data as a part of the model (`model.noise`): a scale of N_ERR, or a fraction of the counts."""
+    sentences = {"scale": too_small(result), "fraction": ""}
+    for term in sentences:
+        model = with_noise(result.model, **{term: "all"})
+        start = np.append(result.values, model.start[len(result.values) :])
+        fitted = fit(Likelihood.of(result.calset, model), start=start, noise_scale=1.0)
+        value, error = fitted.value(model.names[-1])
+        if not fitted.converged or (term == "fraction" and not 0.0 < abs(value) < _LARGEST_FRACTION):
+            continue
+        if fitted.explains_data and is_noise(fitted):
+            worth = fitted.expansion.data + fitted.expansion.log_variance - fitted.dof
+            yield Remedy(sentences[term] or _of_counts(abs(value), error), worth)
 
 
-def _too_small(factor: float) -> str:
-    """The sentence of errors that are too small by a factor."""
+def too_small(result: FitResult) -> str:
+    """The sentence of errors that are too small by the factor √(χ²/dof), which scatters by 1/√(2 dof) of itself."""
+    dof = max(result.dof, 1)
+    factor = float(np.sqrt(result.chi2 / dof))
     return (
-        f"N_ERR is {factor:.3g} times too small: with errors as large the residuals hold nothing but noise; check "
-        "the gain and the unit of N_ERR"
+        f"N_ERR is {with_error(factor, factor / np.sqrt(2.0 * dof))} times too small: with errors as large the "
+        "residuals hold nothing but noise; check the gain and the unit of N_ERR, or have the factor fitted "
+        '([noise] scale = "all" in a model file)'
     )
 
 
-def _share(at: FitResult, stated: CalibrationSet, before: float) -> float:
-    """The share of the counts that, beside the errors stated, makes χ² of the residuals what noise would give."""
-    residual = at.likelihood.residuals(at.values)[1]
-    block = stated.intensities.block(0, len(stated.points))
-    used = block.used
-    sigma, counts = block.sigma[used], block.counts[used]
-    off = residual[used] * np.sqrt(sigma**2 + (before * counts) ** 2)
-
-    def excess(share: float) -> float:
-        return float(np.sum(off**2 / (sigma**2 + (share * counts) ** 2))) - at.dof
-
-    if not excess(0.0) > 0.0 > excess(1.0):
-        return 0.0
-    return float(optimize.root_scalar(excess, bracket=(0.0, 1.0)).root)
-
-
-def _with_share(calset: CalibrationSet, share: float) -> CalibrationSet:
-    table = calset.intensities
-    assert isinstance(table, TableIntensities)
-    sigma = np.sqrt(table.sigma**2 + (share * table.counts) ** 2)
-    return dataclasses.replace(calset, intensities=dataclasses.replace(table, sigma=sigma))
+def _of_counts(fraction: float, error: float) -> str:
+    """The sentence of errors that lack a fraction of the counts."""
+    per_cent = with_error(100 * fraction, 100 * error)
+    return (
+        f"N_ERR lacks {per_cent} % of N: with √(N_ERR² + ({fraction:.2g} N)²) the residuals hold nothing but noise; "
+        "that is scintillation, or a flat field that is left, and belongs into N_ERR, or have it fitted "
+        '([noise] fraction = "all" in a model file)'
+    )
 
 
 def _of_rows(result: FitResult) -> Iterator[Remedy]:

@@ -12,8 +12,9 @@ Start       the first set begins at the start values of the model, as `refit.fit
             from which they are a few steps away.
 Left over   a search that does not end, or ends far from the data (χ²/dof above `search.FAR_OFF`), is made anew by
             `refit.fit`, which scales errors and tries plates one order of retardance away; so is one of a model with
-            air gaps, whose fringe orders are tried there, and one whose plates need more wavelength nodes than were
-            laid out. `ManyFits.alone` names these.
+            air gaps, whose fringe orders are tried there, one whose plates need more wavelength nodes than were laid
+            out, and one with parameters of the errors of the data, which change from place to place. `ManyFits.alone`
+            names these.
 """
 
 from __future__ import annotations
@@ -164,8 +165,12 @@ def refit_many(
     likelihoods = _likelihoods(calsets, model)
     for one in likelihoods:
         check_identifiable(one)
-    stack = Stack.of([_inputs(one) for one in likelihoods])
     first = fit(likelihoods[0])
+    if first.model.template.noise is not None:
+        others = tuple(fit(one) for one in likelihoods[1:])
+        alone = tuple(range(1, len(likelihoods)))
+        return ManyFits((first, *others), alone, time.perf_counter() - began)
+    stack = Stack.of([_inputs(one) for one in likelihoods])
     searches = {
         n: search_of(
             _nearby(first, one.model)[one.model.free],

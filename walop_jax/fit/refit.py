@@ -35,6 +35,7 @@ from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.likelihood.runner import Progress, Runner
+from walop_jax.model.noise import NOISE
 from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
 
@@ -375,6 +376,7 @@ def _against(
         bit = Quality.EXCESS_NOISE if result.noise_scale**2 > 1.0 + EXCESS_NOISE**2 else Quality(0)
         text = f"to reach a solution the errors of the data were multiplied by {result.noise_scale:.3g}"
         yield Doubt(bit, f"{text}: the fit is poor", blocking=False)
+    yield from (Doubt(Quality(0), sentence, blocking=False) for sentence in _of_errors(result))
     instrument = result.model.instrument(result.values).patched()
     for sentence in extrapolations(instrument, curves_of(result.calset)):
         yield Doubt(Quality(0), sentence, blocking=False)
@@ -391,6 +393,14 @@ def _against(
             reason = reason.replace(short, text)
         text = f"errors of parameters are estimated from the scatter of the residuals ({reason})"
         yield Doubt(Quality(0), text, blocking=False)
+
+
+def _of_errors(result: FitResult) -> Iterator[str]:
+    """What a fit has found of the errors of its data, in a sentence."""
+    fitted = [i for i in result.model.positions(NOISE).tolist() if result.sigma[i] > 0]
+    if fitted:
+        terms = ", ".join(f"{result.model.names[i]} = {result[result.model.names[i]]}" for i in fitted)
+        yield f"the errors of the data were fitted, so that χ² tells nothing of them: {terms}"
 
 
 def refit(

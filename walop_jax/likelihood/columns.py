@@ -14,6 +14,7 @@ Limits      first order. Where detectors are not linear their derivative stands 
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ from walop_jax.likelihood.engine import (
     sharing,
 )
 from walop_jax.likelihood.flux import project_flux
-from walop_jax.likelihood.layout import PointReader, median_over_field
+from walop_jax.likelihood.layout import median_over_field
 from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
 from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
@@ -215,7 +216,7 @@ class Columns:
         self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
         self._known: dict[Sentence, list[SlotTerm]] = {}
-        self.reader = PointReader(likelihood.calset, self.plan, likelihood.model.template, mirrored=True)
+        self.reader = dataclasses.replace(likelihood.points.reader, mirrored=True)
         self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
         self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 

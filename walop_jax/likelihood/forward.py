@@ -287,7 +287,7 @@ class Forward(eqx.Module):
             instrument, unit = self._unit(values, point)
             point, ratio = self._with_errors(instrument, point)
             shared = engine.sharing(instrument, self.plan)
-            return log_variance(ratio, unit * point.weight, self.plan.exposures.flux_known, shared)
+            return jnp.sum(log_variance(ratio, unit * point.weight, self.plan.exposures.flux_known, shared))
 
         return jnp.sum(jax.vmap(of)(data))
 

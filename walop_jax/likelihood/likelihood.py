@@ -24,7 +24,7 @@ from walop_jax.likelihood.layout import (
     fields_of_stars,
     planned_instrument,
 )
-from walop_jax.likelihood.noise import noise_expansion, variance_ratio
+from walop_jax.likelihood.noise import log_variance, noise_expansion, variance_ratio
 from walop_jax.likelihood.optics import directions
 from walop_jax.likelihood.runner import Runner
 from walop_jax.model.compiled import array
@@ -430,6 +430,19 @@ class Likelihood:
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
         flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
+
+    def log_variance(self, values: Vector) -> Float[np.ndarray, "p e"]:
+        """What −2 ln L has beside χ² at a full vector of values, of every (point, exposure); 0 without noise terms."""
+        noise = self.model.instrument(values).noise
+        if noise is None:
+            return np.zeros((self.layout.points, len(self.calset.exposures)))
+        stated = dataclasses.replace(self.points, reader=dataclasses.replace(self.points.reader, noise=None))
+        counts, weight = map(stated.gathered, ("counts", "weight"))
+        ratio = variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
+        residual = self.with_errors_at(values).residuals(values)[1]
+        light = np.where(weight > 0, counts * weight / np.sqrt(ratio) - residual, 0.0)
+        shared = engine.sharing(self.model.template, self.plan)
+        return log_variance(ratio, light, self.flux_known, shared)
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.

@@ -64,13 +64,16 @@ def log_variance(
     light: Float[Any, "*p e k"],
     flux_known: Bool[Any, " e"],
     shared: Sharing = ALONE,
-) -> Float[Any, ""]:
-    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²), with a (of any common scale within a flux) = `light`, 0 where unused."""
+) -> Float[Any, "*p e"]:
+    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²) of every row (point, exposure); of a flux of several rows each has its part.
+
+    `light` is a, of any common scale within a flux, 0 where unused.
+    """
     xp = namespace(light)
     part, power = _parts(light, flux_known, shared)
     stated = xp.where(power > 0, shared.summed(ratio * light**2), 1.0)
     taken = xp.log(xp.where(power > 0, power, 1.0) / stated)
-    return xp.sum(xp.log(ratio)) + xp.sum(part * taken)
+    return xp.sum(xp.log(ratio) + part * taken, axis=-1)
 
 
 class NoiseExpansion(NamedTuple):
@@ -117,7 +120,8 @@ def noise_expansion(
     values = np.concatenate([np.asarray(noise.scale), np.asarray(noise.fraction)])
     bent = gradient / np.where(values != 0.0, values, 1.0)
     matrix += np.diag(np.where(of_fraction & (values != 0.0), np.maximum(bent, 0.0), 0.0))
-    return NoiseExpansion(left * float(log_variance(ratio, light, flux_known, shared)), gradient, matrix)
+    value = left * float(np.sum(log_variance(ratio, light, flux_known, shared)))
+    return NoiseExpansion(value, gradient, matrix)
 
 
 def _parts(

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 NOISE = "noise"
 """The part of an instrument that holds the terms."""
+COMMON = "noise.scale"
+"""Name of the scale of all errors."""
 ALL = "all"
 """Name of the group of all intensities."""
 FRACTION_START = 0.003

@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # slow to import, and most commands read no posterior
 
 DRAWS = 200  # of a posterior, that stand for it in matrices
 INFLATION = "noise.ln_f"
+"""Variable in the posteriors of earlier versions: ln of a factor on the errors, which was no parameter of the model."""
 _AGAIN = "run walop-jax sample again"
 
 A_MEAN = "is the mean over models that its data cannot separate, and no fit of a single one"

@@ -30,7 +30,7 @@ from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.posterior.draws import INFLATION, as_arviz, group_of_draws
+from walop_jax.posterior.draws import as_arviz, group_of_draws
 from walop_jax.posterior.samplers import Sampler, make_sampler
 from walop_jax.posterior.surrogate import Accuracy
 from walop_jax.posterior.target import LARGEST_SAMPLED
@@ -216,7 +216,6 @@ class Options:
     thin: int = 0
     moves: str = "laplace"
     order: int = 3
-    inflate: bool = False
     draws: int = 4000
     checks: int = 256
     ensembles: int = 2
@@ -276,7 +275,6 @@ class PosteriorSample(Drawn):
     units: tuple[str, ...]
     draws: Float[np.ndarray, "e d n"]
     log_posterior: Float[np.ndarray, "e d"]
-    ln_f: Float[np.ndarray, "e d"] | None
     mean: Vector
     covariance: Float[np.ndarray, "n n"]
     chains: Chains
@@ -356,11 +354,7 @@ class PosteriorSample(Drawn):
         varies = self.varying
         values = self.draws.reshape(-1, len(self.names))[:, varies]
         names, units = [self.names[i] for i in varies], [self.units[i] for i in varies]
-        if self.ln_f is not None:
-            values = np.concatenate([values, self.ln_f.reshape(-1, 1)], axis=1)
-            names, units = [*names, INFLATION], [*units, ""]
         deviation = np.sqrt(np.diag(self.covariance))[varies]
-        deviation = np.append(deviation, values[:, len(varies) :].std(axis=0))
         columns: dict[str, Column] = {
             "NAME": (np.array(names), "", "coefficient"),
             "UNIT": (np.array(units), "", "unit of the numbers in this row"),
@@ -387,9 +381,10 @@ class PosteriorSample(Drawn):
     def log_likelihood(self) -> Float[np.ndarray, "e d r"]:
         """ln p of every used row (point, exposure) at every draw, for `arviz.loo`.
 
-        Equation    ln p = −½ (χ²/f² + m ln 2π f²) − Σ ln σ
-        Symbols     χ² of the intensities of the row, its flux eliminated; σ their errors, f the factor on them; m the
-                    number of intensities less the fluxes
+        Equation    ln p = −½ (χ²/f² + m ln 2π f² + v) − Σ ln σ
+        Symbols     χ² of the intensities of the row, its flux eliminated; σ their errors as stated, f the factor under
+                    which the fit was made; m the number of intensities less the fluxes; v what errors with parameters
+                    add (`likelihood/noise.py`), 0 without
         Limits      the flux is at its best value, not integrated over. Rows that share a flux are not independent
 
         Raises ValueError where the data are not at hand, and where rows share a flux, or the q, u of a star.
@@ -405,12 +400,14 @@ class PosteriorSample(Drawn):
             raise ValueError(f"{what}: their rows cannot be left out one by one")
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)
         chi2 = np.empty((*self.draws.shape[:2], int(used.sum())))
+        v, likelihood = np.zeros_like(chi2), likelihood.with_errors_at(None)
         for at in np.ndindex(chi2.shape[:2]):
             chi2[at] = np.sum(likelihood.residuals(self.draws[at])[1] ** 2, axis=2)[used]
-        f = np.full(chi2.shape[:2], self.noise_scale) * (1.0 if self.ln_f is None else np.exp(self.ln_f))
-        f, m = f[..., None], per_row[used]
+            if likelihood.fits_errors:
+                v[at] = likelihood.log_variance(self.draws[at])[used]
+        f, m = self.noise_scale, per_row[used]
         ln_weight = np.log(likelihood.points.gathered("weight")[used]).sum(axis=1)
-        return -0.5 * (chi2 / f**2 + m * np.log(2 * np.pi * f**2)) + ln_weight
+        return -0.5 * (chi2 / f**2 + m * np.log(2 * np.pi * f**2) + v) + ln_weight
 
     def to_arviz(self, log_likelihood: bool = False) -> Any:
         """For ArviZ, `InferenceData`, or `DataTree` from ArviZ 1 on: a variable per coefficient that varies, with unit.
@@ -427,8 +424,6 @@ class PosteriorSample(Drawn):
 
         varies = self.varying
         draws = {self.names[i]: self.draws[:, :, i] for i in varies}
-        if self.ln_f is not None:
-            draws[INFLATION] = self.ln_f
         posterior = group_of_draws(draws, {self.names[i]: self.units[i] for i in varies})
         v = self.convergence
         for k, name in enumerate(v.names):

@@ -18,6 +18,7 @@ from walop_jax.fit.refit import FitResult, covariance
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.code import versions_of
 from walop_jax.io.errors import fail
+from walop_jax.model.noise import COMMON, NOISE
 from walop_jax.model.specification import Model
 from walop_jax.posterior import result as results
 from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
@@ -196,7 +197,9 @@ def sample(
         stated = dataclasses.replace(result, covariance=inverse, errors_from=STATED)
         as_stated = sample(stated, options, folder=folder, resume=resume, report=report)
         return sandwich_adjusted(as_stated, result.model, inverse, result.covariance, result.errors_from)
-    sampler, target = options.make_sampler(), Target(result)
+    sampler = options.make_sampler()
+    scale = None if sampler.exact else _common_scale(result)
+    target = Target(result if scale is None else _with_scale_held(result))
     marks = {} if folder is None else fingerprint(target, options)
     chain = Chain(folder, marks) if folder is not None and sampler.resumes else None
     if chain is not None and chain.path.exists():
@@ -205,13 +208,13 @@ def sample(
         chain.load()  # a chain of another fit is refused before the work
     began, sampled = time.perf_counter(), choose_sampled(target, options.parameters)
     if sampler.exact:
-        posterior = ExactPosterior(target, sampled, options.inflate)
+        posterior = ExactPosterior(target, sampled)
     else:
         posterior = build_surrogate(
             target,
             sampled=sampled,
             order=options.order,
-            inflate=options.inflate,
+            scale=scale,
             seed=options.seed,
             progress=lambda done, total: report(Progress("tabulating the model", done / total)),
         )
@@ -223,6 +226,29 @@ def sample(
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
     return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
+
+
+def _common_scale(result: FitResult) -> float | None:
+    """The fitted scale of all errors, None where no parameter of the errors is free.
+
+    Raises `DataError` for other parameters of the errors: the surrogate has only the errors of all data together.
+    """
+    model = result.model
+    free = [model.names[i] for i in model.free if model.parameters[i].part == NOISE]
+    if not free:
+        return None
+    if free != [COMMON] or model[COMMON].prior is not None:
+        odd = ", ".join(free)
+        what = f"errors of the data have parameters ({odd}) that the surrogate of emcee cannot have"
+        advice = "sample the exact posterior (--sampler nuts), or fix them in the model file (free = false)"
+        raise fail(f"{what}; it has one scale of all errors, without a prior", advice=advice)
+    return result.value(COMMON)[0]
+
+
+def _with_scale_held(result: FitResult) -> FitResult:
+    """The fit with the scale of the errors fixed where it was found."""
+    model = result.model.change(COMMON, free=False, start=result.value(COMMON)[0])
+    return dataclasses.replace(result, likelihood=dataclasses.replace(result.likelihood, model=model))
 
 
 def _evenly(count: int, wanted: int) -> Int[np.ndarray, " m"]:
@@ -243,22 +269,29 @@ def _finish(
     flat = z[:, steps].reshape(e, -1, d)
     x = posterior.draw(flat.reshape(-1, d), rng)
     values = np.array([target.values(point) for point in x]).reshape(e, flat.shape[1], -1)
+    mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
+    select = target.model.selection()
+    mean, spread = target.values(mean), select @ spread @ select.T
+    if isinstance(posterior, Surrogate) and posterior.scale is not None:
+        # It is no coordinate of the surrogate's parameters, but one of the draws.
+        i, drawn = target.model.index(COMMON), posterior.scales(z)
+        values[..., i] = posterior.scales(flat)
+        mean[i], spread[i, i] = drawn.mean(), drawn.var()
     accuracy = None
     if isinstance(posterior, Surrogate):
         checked = z.reshape(-1, d)[_evenly(e * n * w, options.checks)]
         accuracy = compare_with_exact(target, posterior, checked, rng)
-    mean, spread = posterior.moments(z.reshape(-1, d)[:: max(1, e * n * w // 50_000)])
-    select = target.model.selection()
-    shown = len(posterior.sampled) + int(posterior.inflate)
+    shown = len(posterior.sampled)
+    if isinstance(posterior, Surrogate):
+        shown = len(posterior.monitored_names)
     return PosteriorSample(
         sampler=ensembles.sampler.name,
         names=target.model.names,
         units=tuple(p.unit for p in target.model.parameters),
         draws=values,
         log_posterior=lnp[:, steps].reshape(e, -1),
-        ln_f=flat[:, :, -1] * posterior.ln_f_unit if posterior.inflate else None,
-        mean=target.values(mean),
-        covariance=select @ spread @ select.T,
+        mean=mean,
+        covariance=spread,
         chains=posterior.monitored(z)[..., :shown],
         sampled=posterior.monitored_names[:shown],
         thin=ensembles.thin,

@@ -15,8 +15,9 @@ exact residuals is kept, so χ² = yᵀ Q y costs the same for 10⁴ and 10⁹ d
 H is the true half Hessian of the objective. Its determinant tilts the marginal, and the skewness behind it displaces
 the means of s from the mode; ∇ ln det H_ss = Σ_j (g(S_j) + g(−S_j) − 2 g(0)) from exact half gradients g.
 
-With noise inflation the errors of the data are times f, and Q_ss = D/f² + P is diagonal in the common
-eigenvectors of D and P; − n ln f is added, ln f having the prior N(0, 1). Its coordinate is ln f √(2n).
+A common scale s of the errors of the data (`noise.scale`) is f times its fitted value, and Q_ss = D/f² + P is diagonal
+in the common eigenvectors of D and P; − n ln f + ln f is added, for the n data and for a prior that is flat in s. Its
+coordinate is ln f √(2n). Other parameters of the errors need the exact posterior.
 
 `compare_with_exact` compares it with the exact posterior, all coefficients together, at draws of the surrogate's.
 
@@ -36,9 +37,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import compiled
-from walop_jax.posterior.draws import INFLATION
+from walop_jax.model.noise import COMMON
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import LN_F_WIDTH, Target, choose_sampled, ln_f_unit
+from walop_jax.posterior.target import Target, choose_sampled, ln_scale_unit
 
 Matrix = Float[np.ndarray, "..."]
 Draws = Float[np.ndarray, "n k"]
@@ -51,7 +52,10 @@ BENT = 8  # directions that get cubic terms
 
 @dataclasses.dataclass(frozen=True)
 class Surrogate:
-    """Everything needed to evaluate and to draw; `inflate` adds ln f as the last sampled coordinate.
+    """Everything needed to evaluate and to draw.
+
+    `scale` is the fitted value of a common scale of the errors, whose ln f is the last sampled coordinate then; None:
+    the errors are as they are.
 
     x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given; `linear`
     turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for the priors,
@@ -72,21 +76,22 @@ class Surrogate:
     slope: Float[np.ndarray, " k"]
     skew: Float[np.ndarray, " s"]
     measured: int
-    inflate: bool = False
+    scale: float | None = None
 
     @property
     def dimension(self) -> int:
         """Number of sampled coordinates."""
-        return self.along.shape[1] + int(self.inflate)
+        return self.along.shape[1] + int(self.scale is not None)
 
-    @property
-    def ln_f_unit(self) -> float:
-        """Change of ln f per unit of its coordinate."""
-        return ln_f_unit(self.measured)
+    def scales(self, z: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, " *n"]:
+        """The common scale of the errors of every draw; 1 where there is none."""
+        if self.scale is None:
+            return np.ones(z.shape[:-1])
+        return self.scale * np.exp(ln_scale_unit(self.measured) * z[..., -1])
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
         """1/f² of every draw."""
-        return np.exp(-2.0 * self.ln_f_unit * z[:, -1]) if self.inflate else np.ones(len(z))
+        return (self.scales(z) / (self.scale or 1.0)) ** -2
 
     def features(self, z: Draws) -> Float[np.ndarray, "n h"]:
         """h for every draw."""
@@ -96,7 +101,7 @@ class Surrogate:
         """The marginal density of the sampled coordinates, many positions at a time."""
         h = self.data.shape[0] - len(self.share)
         pairs, triples = jnp.asarray(self.pairs), jnp.asarray(self.triples)
-        if self.inflate:
+        if self.scale is not None:
             mixed = [self.linear.T @ q[h:, :h] for q in (self.data, self.prior)]
             prior = self._tilted(self.prior[:h, :h])
             constants = (self.data[:h, :h], prior, *mixed, self.share, np.asarray(float(self.measured)))
@@ -119,13 +124,13 @@ class Surrogate:
     @property
     def monitored_names(self) -> tuple[str, ...]:
         """Names of the sampled parameters."""
-        return (*(self.names[i] for i in self.sampled), *((INFLATION,) if self.inflate else ()))
+        return (*(self.names[i] for i in self.sampled), *((COMMON,) if self.scale is not None else ()))
 
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
-        """The sampled coefficients themselves (and ln f) at sampled coordinates."""
+        """The sampled coefficients themselves, and the scale of the errors, at sampled coordinates."""
         k = self.along.shape[1]
         physical = self.centre[self.sampled] + z[..., :k] @ self.along[self.sampled].T
-        return np.concatenate([physical, z[..., k:] * self.ln_f_unit], axis=-1)
+        return physical if self.scale is None else np.append(physical, self.scales(z)[..., None], axis=-1)
 
     def _tilted(self, form: Matrix) -> Matrix:
         """A quadratic form in h with the linear term of the determinant added."""
@@ -199,7 +204,7 @@ def _inflated(
     precision = weight[:, None] * share + (1.0 - share)
     pull = weight[:, None] * (h @ by_data.T) + h @ by_prior.T
     chi2 = chi2 - jnp.sum(pull**2 / precision, axis=1) + jnp.sum(jnp.log(precision), axis=1)
-    return -0.5 * (chi2 + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
+    return -0.5 * chi2 - (measured - 1.0) * ln_f
 
 
 def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
@@ -240,11 +245,14 @@ def build_surrogate(
     *,
     sampled: Int[np.ndarray, " k"] | None = None,
     order: int = 3,
-    inflate: bool = False,
+    scale: float | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Surrogate:
-    """Fit the surrogate (`order` 2 or 3) to exact residuals at about 1.5 design points per feature."""
+    """Fit the surrogate (`order` 2 or 3) to exact residuals at about 1.5 design points per feature.
+
+    `scale` is the fitted value of a common scale of the errors, which is sampled as well; None: no scale.
+    """
     if order not in (2, 3):
         raise ValueError(f"order {order}: the surrogate is of order 2 or 3")
     sampled = choose_sampled(target) if sampled is None else sampled
@@ -275,7 +283,7 @@ def build_surrogate(
     return Surrogate(
         names=target.names, sampled=sampled, centre=target.centre, along=along, across=across, pairs=pairs,
         triples=triples, data=0.5 * (data + data.T), prior=prior, linear=linear, share=share,
-        slope=slope, skew=skew, measured=target.measured, inflate=inflate,
+        slope=slope, skew=skew, measured=target.measured, scale=scale,
     )  # fmt: skip
 
 

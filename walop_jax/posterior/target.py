@@ -2,6 +2,8 @@
 
     −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
 
+Where errors of the data have parameters, the other terms of `likelihood/noise.py` are part of it.
+
 A sampler is given either this, in all free parameters (`ExactPosterior`), or the surrogate in the physics coefficients
 alone: throughput series and catalogue values of the standards are near-linear, so that they can be marginalised in
 closed form (`surrogate`) and drawn afterwards.
@@ -22,13 +24,11 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.forward import Forward
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
-from walop_jax.posterior.draws import INFLATION
 from walop_jax.posterior.samplers import Density
 
 Vector = Float[np.ndarray, " f"]
 Draws = Float[np.ndarray, "n k"]
 LARGEST_SAMPLED = 20
-LN_F_WIDTH = 1.0  # prior of ln f, the noise inflation
 NEAR_LINEAR = ("throughput", "standard")
 
 
@@ -37,8 +37,8 @@ def _instrument(template: Instrument, values: Float[Array, " n"]) -> Instrument:
     return with_values(template)(values)
 
 
-def ln_f_unit(measured: int) -> float:
-    """Change of ln f, the noise inflation, per unit of its coordinate: about its standard error."""
+def ln_scale_unit(measured: int) -> float:
+    """Change of ln s, s a common scale of the errors, per unit of its coordinate: about its standard error."""
     return 1.0 / np.sqrt(2.0 * max(measured, 1))
 
 
@@ -122,38 +122,26 @@ class ExactPosterior:
     """The posterior of all free parameters in w, where x = x̂ + L w and L Lᵀ is the covariance of the fit.
 
     Nothing is marginalised but the fluxes. `sampled` are the positions of the coefficients that figures show; all are
-    sampled. With `inflate` the errors of the data are times f; ln f has the prior N(0, 1), and ln f √(2n) is the last
-    coordinate.
+    sampled, those of the errors of the data among them.
     """
 
     target: Target
     sampled: Int[np.ndarray, " k"]
-    inflate: bool = False
 
     def density(self) -> Density:
         """Its density; χ² is that of the forward model: the memory of a gradient is that of one batch of points."""
-        target, inflate, unit = self.target, self.inflate, self.ln_f_unit
+        target = self.target
         forward = Forward.of(target.likelihood.calset, target.model)
         first, along = target.values(target.centre), target.model.selection() @ target.root
         linear = (first, along, target.prior_rows(target.centre), target.prior_slopes(target.root))
-        measured, free = float(target.measured), len(target.free)
 
         def log_density(
             w: Array, forward: Forward, first: Array, along: Array, offset: Array, slope: Array
         ) -> Array:
-            chi2 = forward.chi2(first + along @ w[:free]) / target.noise_scale**2
-            total = jnp.sum((offset + slope @ w[:free]) ** 2)
-            if not inflate:
-                return -0.5 * (chi2 + total)
-            ln_f = w[-1] * unit
-            return -0.5 * (chi2 * jnp.exp(-2.0 * ln_f) + total + (ln_f / LN_F_WIDTH) ** 2) - measured * ln_f
+            data = forward.log_likelihood(first + along @ w) / target.noise_scale**2
+            return data - 0.5 * jnp.sum((offset + slope @ w) ** 2)
 
-        return Density(free + int(inflate), log_density, (forward, *map(jnp.asarray, linear)))
-
-    @property
-    def ln_f_unit(self) -> float:
-        """Change of ln f per unit of its coordinate."""
-        return ln_f_unit(self.target.measured)
+        return Density(len(target.free), log_density, (forward, *map(jnp.asarray, linear)))
 
     @property
     def _order(self) -> Int[np.ndarray, " f"]:
@@ -162,20 +150,16 @@ class ExactPosterior:
 
     @property
     def monitored_names(self) -> tuple[str, ...]:
-        """Names of all free parameters: those that figures show, ln f, the others."""
-        names = [self.target.names[i] for i in self._order]
-        k = len(self.sampled)
-        return (*names[:k], *((INFLATION,) if self.inflate else ()), *names[k:])
+        """Names of all free parameters: those that figures show, then the others."""
+        return tuple(self.target.names[i] for i in self._order)
 
     def monitored(self, z: Float[np.ndarray, "... k"]) -> Float[np.ndarray, "... q"]:
-        """The free parameters (and ln f), in the order of their names."""
-        free, k = len(self.target.free), len(self.sampled)
-        x = (self.target.centre + z[..., :free] @ self.target.root.T)[..., self._order]
-        return np.concatenate([x[..., :k], z[..., free:] * self.ln_f_unit, x[..., k:]], axis=-1)
+        """The free parameters, in the order of their names."""
+        return (self.target.centre + z @ self.target.root.T)[..., self._order]
 
     def draw(self, z: Draws, rng: np.random.Generator) -> Float[np.ndarray, "n f"]:
         """Free parameters at sampled coordinates; nothing is left to be drawn."""
-        return self.target.centre + z[:, : len(self.target.free)] @ self.target.root.T
+        return self.target.centre + z @ self.target.root.T
 
     def moments(self, z: Draws) -> tuple[Vector, Float[np.ndarray, "f f"]]:
         """Mean and covariance of all free parameters over draws."""

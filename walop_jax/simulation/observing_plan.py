@@ -118,7 +118,9 @@ class ObservingPlan:
     unless stops say, and have 0.55 µm. After them come `zero_exposures` of a field of `zero_stars` stars that are all
     measured at once: their mean q and u are 0 with an error of `zero_error`, they scatter by `zero_scatter` around it;
     among stops it is the standard that follows the last one. `electrons` is the level of a camera in unpolarised light
-    of full transparency, ahead of reflections.
+    of full transparency, ahead of reflections. N_ERR holds the noise of photons and `read_noise` (electrons); counts
+    scatter by `noise_scale` times that, and by `noise_fraction` of the counts in quadrature (`model.noise`), so that a
+    set may have errors that are stated too small.
 
     `instrument` is one that comes with the package, by name, or any other; None: the first of the family. `moving`
     holds the positions (deg, None: out) of further moving elements by the prefix of their columns: the polariser goes
@@ -153,6 +155,8 @@ class ObservingPlan:
     plate: tuple[float | None, ...] = (None,)
     electrons: float = 1e6
     read_noise: float = 30.0
+    noise_scale: float = 1.0
+    noise_fraction: float = 0.0
     teff: float = 5772.0
     temperature: tuple[float, float] = (12.0, 8.0)
     mjd: float | None = None

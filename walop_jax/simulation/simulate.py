@@ -244,9 +244,12 @@ def simulate(
         # A generator for each point: a last digit that another machine computes differently stays where it is.
         drawn = [detector.draw(*pair) for pair in zip(noise.spawn(len(expected)), expected, strict=True)]
         counts, sigma = (np.stack(arrays) for arrays in zip(*drawn, strict=True))
+        stated = detector.sigma(expected)
+        true_error = np.hypot(plan.noise_scale * stated, plan.noise_fraction * expected)
+        if (plan.noise_scale, plan.noise_fraction) != (1.0, 0.0):
+            counts = expected + (counts - expected) * true_error / stated
         if floor := truth.cameras.floor:
             # Noise up to the errors that fits take the cameras to have; N_ERR has it not.
-            stated = detector.sigma(expected)
             beyond = np.sqrt(with_floor(stated, expected, floor) ** 2 - stated**2)
             counts += beyond * noise.standard_normal(expected.shape)
     table = TableIntensities.of(blank.intensities, blank.points)
