@@ -52,7 +52,9 @@ def test_a_scale_makes_up_for_errors_as_stated(factor):
     assert found.chi2 == pytest.approx(found.dof, rel=0.02)
     with_scale = fit(Likelihood.of(with_stated(plain.calset, factor * value), plain.model))
     free, n = plain.model.free, len(plain.values)
-    np.testing.assert_allclose(found.values[:n][free], with_scale.values[free], atol=1e-3 * plain.sigma[free].max())
+    np.testing.assert_allclose(
+        found.values[:n][free], with_scale.values[free], atol=1e-3 * plain.sigma[free].max()
+    )
     np.testing.assert_allclose(found.sigma[:n][free], with_scale.sigma[free], rtol=1e-2)
 
 

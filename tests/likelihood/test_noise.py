@@ -16,7 +16,7 @@ from walop_jax.model.noise import Noise
 KINDS = ("clp", "clp", "moon", "flux", "steady", "steady")
 CAMERAS = ("O1", "E1", "O2", "E2")
 FLUX_KNOWN = np.array([kind == "flux" for kind in KINDS])
-GROUPS = np.array([[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 1]], float)
+GROUPS = np.eye(5)[[0, 1, 2, 3, 4, 4]]  # the two exposures of the steady lamp share a flux
 BY_ARM = np.kron(np.eye(2), np.ones((2, 2)))
 POINTS = 3
 
@@ -37,7 +37,9 @@ class Scene:
     def groups(self) -> list[list[tuple[int, int, int]]]:
         """The intensities that have a flux in common; those of a known one each for itself."""
         cameras = np.ones((4, 4)) if self.shared.cameras is None else self.shared.cameras
-        exposures = np.eye(6) if self.shared.exposures is None else self.shared.exposures @ self.shared.exposures.T
+        exposures = (
+            np.eye(6) if self.shared.exposures is None else self.shared.exposures @ self.shared.exposures.T
+        )
         groups: dict[tuple[int, ...], list[tuple[int, int, int]]] = {}
         for p, e, k in itertools.product(range(POINTS), range(6), range(4)):
             if self.weight[p, e, k] > 0:
@@ -168,7 +170,9 @@ def test_its_matrix_is_the_covariance_of_its_gradient_over_noise(name: str):
     information = noise_expansion(noise, terms, *data, FLUX_KNOWN, scene.shared).matrix
     bent = noise_expansion(noise, terms, *data, FLUX_KNOWN, scene.shared).gradient / here
     first = len(terms.scale)
-    information[np.diag_indices(len(here))] -= np.where(np.arange(len(here)) >= first, np.maximum(bent, 0.0), 0.0)
+    information[np.diag_indices(len(here))] -= np.where(
+        np.arange(len(here)) >= first, np.maximum(bent, 0.0), 0.0
+    )
     scale = np.sqrt(np.diag(information))
     np.testing.assert_allclose(
         np.cov(np.array(drawn).T).reshape(information.shape) / np.outer(scale, scale),

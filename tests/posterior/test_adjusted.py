@@ -32,7 +32,7 @@ def tied_model() -> Model:
 def sample(draws: np.ndarray, covariance: np.ndarray) -> PosteriorSample:
     one = np.ones(1)
     return PosteriorSample(
-        sampler="emcee", names=("a", "b", "c"), units=("",) * 3, draws=draws, log_posterior=draws[..., 0], ln_f=None,
+        sampler="emcee", names=("a", "b", "c"), units=("",) * 3, draws=draws, log_posterior=draws[..., 0],
         mean=draws.mean(axis=(0, 1)), covariance=covariance, chains=np.zeros((len(draws), 1, 1, 1)),
         sampled=("a",), thin=1,
         convergence=Convergence(("a",), 1, one, (1.0, 1.0, 1.0), one, one, 0, ()), accuracy=None, acceptance=0.5,

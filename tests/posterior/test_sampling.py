@@ -14,9 +14,11 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import matrices, matrix_draws
 from walop_jax.data.settings import Settings
 from walop_jax.data.user_tables import read_input_table
+from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.errors import DataError
 from walop_jax.io.plain_tables import astropy_table, write_table
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.noise import with_noise
 from walop_jax.posterior import sampling
 from walop_jax.posterior.draws import read_draws, with_draws, with_moments
 from walop_jax.posterior.files import write_posterior
@@ -30,12 +32,19 @@ OPTIONS = Options(seed=3, interval=200, draws=2000, checks=64)
 
 @pytest.fixture(autouse=True)
 def _built_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The surrogate of the scene, with or without inflation, instead of a new one for every test."""
+    """The surrogate of the scene, with or without a scale of the errors, instead of a new one for every test."""
 
-    def build(*args: Any, inflate: bool = False, **others: Any) -> Any:
-        return dataclasses.replace(scene.surrogate, inflate=inflate)
+    def build(*args: Any, scale: float | None = None, **others: Any) -> Any:
+        return dataclasses.replace(scene.surrogate, scale=scale)
 
     monkeypatch.setattr(sampling, "build_surrogate", build)
+
+
+def with_scale(scene: Scene) -> FitResult:
+    """The fit of the scene with a scale of all errors."""
+    model = with_noise(scene.result.model, scale="all")
+    start = np.append(scene.result.values, 1.0)
+    return fit(Likelihood.of(scene.result.calset, model), start=start).judged()
 
 
 @pytest.fixture(scope="module")
@@ -108,16 +117,31 @@ def test_a_chain_cut_short_says_so(scene: Scene, tmp_path: Path) -> None:
         read_draws(tmp_path / "short.nc", short.names)
 
 
-def test_inflation_finds_the_noise_as_stated(scene: Scene) -> None:
-    options = dataclasses.replace(OPTIONS, inflate=True, interval=400)
-    inflated = sample(scene.result, options)
-    assert inflated.trusted, inflated.warnings
-    assert inflated.ln_f is not None
+def test_a_scale_of_the_errors_is_sampled_with_the_rest(scene: Scene) -> None:
+    result = with_scale(scene)
+    sampled = sample(result, dataclasses.replace(OPTIONS, interval=400))
+    assert sampled.trusted, sampled.warnings
     measured = scene.target.measured
-    expected = 0.5 * np.log(scene.result.expansion.data / (measured - len(scene.target.free)))
-    assert inflated.ln_f.mean() == pytest.approx(expected, abs=1.0 / np.sqrt(measured))
-    assert inflated.ln_f.std() == pytest.approx(1.0 / np.sqrt(2 * measured), rel=0.15)
-    assert "noise.ln_f" in inflated.intervals()["NAME"][0]
+    value, error = sampled.value("noise.scale")
+    expected = np.sqrt(scene.result.expansion.data / (measured - len(scene.target.free)))
+    assert value == pytest.approx(expected, abs=1.0 / np.sqrt(measured))
+    assert error == pytest.approx(expected / np.sqrt(2 * measured), rel=0.15)
+    drawn = sampled.draws[..., sampled.names.index("noise.scale")]
+    assert (drawn.mean(), drawn.std()) == (
+        pytest.approx(value, abs=0.1 * error),
+        pytest.approx(error, rel=0.1),
+    )
+    assert "noise.scale" in sampled.intervals()["NAME"][0]
+    assert "noise.scale" in sampled.sampled
+
+
+def test_errors_that_differ_between_cameras_need_the_exact_posterior(scene: Scene) -> None:
+    calset = scene.result.calset
+    model = with_noise(scene.result.model, fraction="camera")
+    start = np.append(scene.result.values, model.start[len(scene.result.values) :])
+    result = fit(Likelihood.of(calset, model), start=start).judged()
+    with pytest.raises(DataError, match=r"noise\.fraction_O1.*--sampler nuts"):
+        sample(result, OPTIONS)
 
 
 def test_posterior_file_table_and_report(posterior: PosteriorSample, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
-from walop_jax.posterior.target import Target, choose_sampled, near_linear
+from walop_jax.posterior.target import Target, choose_sampled, ln_scale_unit, near_linear
 
 from .conftest import Scene
 
@@ -35,14 +35,16 @@ def test_marginal_of_a_gaussian_is_the_block_of_its_covariance(gaussian: Surroga
     np.testing.assert_allclose(found, covariance, atol=0.04)
 
 
-def test_inflation_is_the_plain_posterior_at_f_1_and_the_integral_elsewhere(gaussian: Surrogate) -> None:
-    inflated = dataclasses.replace(gaussian, inflate=True)
+def test_a_scale_of_errors_is_the_plain_posterior_at_its_fit_and_the_integral_elsewhere(
+    gaussian: Surrogate,
+) -> None:
+    inflated = dataclasses.replace(gaussian, scale=1.3)
     z = np.random.default_rng(1).standard_normal((20, 4))
     at_one = inflated.density().log_density(np.column_stack([z, np.zeros(20)]))
     np.testing.assert_allclose(at_one, gaussian.density().log_density(z), atol=1e-12)
     # ∫ exp(−½ (χ²_data/f² + χ²_prior)) ds by brute force, up to a constant that f does not enter
     ln_f = np.array([-0.2, 0.0, 0.3])
-    coordinates = np.column_stack([z[:3], ln_f / inflated.ln_f_unit])
+    coordinates = np.column_stack([z[:3], ln_f / ln_scale_unit(inflated.measured)])
     linear = [1, 2, 3, 4, -3, -2, -1]
     values = []
     for one, log in zip(z[:3], ln_f, strict=True):
@@ -52,22 +54,22 @@ def test_inflation_is_the_plain_posterior_at_f_1_and_the_integral_elsewhere(gaus
         log_determinant = (
             np.linalg.slogdet(own)[1] - np.linalg.slogdet((gaussian.data + gaussian.prior)[-3:, -3:])[1]
         )
-        values.append(-0.5 * (chi2 + log_determinant + log**2) - 1000 * log)
+        values.append(-0.5 * (chi2 + log_determinant) - 999 * log)
     np.testing.assert_allclose(inflated.density().log_density(coordinates), values, rtol=1e-10)
 
 
-@pytest.mark.parametrize("inflate", [False, True])
-def test_the_density_that_is_compared_is_that_of_the_draws(gaussian: Surrogate, inflate: bool) -> None:
+@pytest.mark.parametrize("scale", [None, 1.3])
+def test_the_density_that_is_compared_is_that_of_the_draws(gaussian: Surrogate, scale: float | None) -> None:
     """The density of sampled coordinates times the normal distribution of the others, by scipy, up to a constant."""
     rng, weak = np.random.default_rng(5), np.zeros_like(gaussian.data)
     weak[5:15, -3:] = 0.1 * rng.standard_normal((10, 3))
     skewed = dataclasses.replace(
-        gaussian, data=gaussian.data + weak + weak.T, inflate=inflate, slope=0.2 * rng.standard_normal(4),
+        gaussian, data=gaussian.data + weak + weak.T, scale=scale, slope=0.2 * rng.standard_normal(4),
         skew=rng.standard_normal(3),
     )  # fmt: skip
-    z = rng.standard_normal((30, 4 + inflate))
+    z = rng.standard_normal((30, 4 + (scale is not None)))
     x = skewed.draw(z, rng)
-    f = np.exp(skewed.ln_f_unit * z[:, 4:]) if inflate else np.ones((30, 1))
+    f = np.exp(z[:, 4:] / np.sqrt(2.0 * skewed.measured)) if scale else np.ones((30, 1))
     expected = []
     for at, place, factor in zip(z[:, :4], x, f[:, 0], strict=True):
         h = skewed.features(at[None])[0]
@@ -76,9 +78,8 @@ def test_the_density_that_is_compared_is_that_of_the_draws(gaussian: Surrogate, 
         mean = -own @ (q[-3:, :15] @ h + 0.5 * skewed.skew)
         expected.append(multivariate_normal(mean, own).logpdf(place[4:]))
     ln_f = np.log(f[:, 0])
-    own_of_f = (
-        -0.5 * ln_f**2 - 1000 * ln_f
-    )  # the prior of ln f and its share of the likelihood, which cancel there
+    # A flat prior of the scale, and its part of the likelihood, which cancel in the comparison.
+    own_of_f = ln_f - 1000 * ln_f
     total = skewed.density().log_density(z) + np.array(expected) - own_of_f
     np.testing.assert_allclose(np.diff(-0.5 * skewed.joint(z, x)), np.diff(total), atol=1e-9)
 
@@ -155,11 +156,11 @@ def test_target_is_what_the_fit_minimises(scene: Scene) -> None:
 
 def test_draws_take_their_share_of_errors_that_are_inflated(gaussian: Surrogate) -> None:
     """A draw with ln f has the data's part of the quadratic form over f²; with ln f = 0 it is the plain one."""
-    inflated = dataclasses.replace(gaussian, inflate=True)
+    inflated = dataclasses.replace(gaussian, scale=1.3)
     rng = np.random.default_rng(4)
     z = np.column_stack([rng.standard_normal((5, 4)), [0.0, 0.0, 1.0, -1.0, 2.0]])
     x = gaussian.place(z[:, :4], rng.standard_normal((5, 3)))
-    f = np.exp(inflated.monitored(z)[:, -1])
+    f = inflated.monitored(z)[:, -1] / 1.3
     assert f[:2].tolist() == [1.0, 1.0]
     np.testing.assert_allclose(inflated.weight(z), f**-2, rtol=1e-12)
     without = dataclasses.replace(gaussian, data=np.zeros_like(gaussian.data))
@@ -169,8 +170,8 @@ def test_draws_take_their_share_of_errors_that_are_inflated(gaussian: Surrogate)
 
 def test_what_was_marginalised_is_drawn_with_the_errors_of_the_draw(gaussian: Surrogate) -> None:
     """Twice the errors: covariance of the marginalised coefficients given the others, by brute force."""
-    inflated = dataclasses.replace(gaussian, inflate=True)
-    z = np.tile([0.3, -0.2, 0.1, 0.4, np.log(2.0) / inflated.ln_f_unit], (40000, 1))
+    inflated = dataclasses.replace(gaussian, scale=1.3)
+    z = np.tile([0.3, -0.2, 0.1, 0.4, np.log(2.0) / ln_scale_unit(inflated.measured)], (40000, 1))
     x = inflated.draw(z, np.random.default_rng(6))
     offset = x - gaussian.centre - z[:, :4] @ gaussian.along.T
     s = np.linalg.lstsq(gaussian.across, offset.T, rcond=None)[0].T

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.noise import with_noise
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import ExactPosterior, choose_sampled
+from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
 from .conftest import Scene
 
@@ -50,20 +53,22 @@ def test_its_gradient_is_that_of_finite_differences(
     assert np.abs(at_the_fit).max() < 0.02 < np.abs(gradient).max()
 
 
-def test_inflation_divides_chi2_by_f_squared(scene: Scene, density: Density, place: np.ndarray) -> None:
-    """ln p = −½ (χ²/f² + priors + ln² f) − n ln f, by hand; its coordinate is ln f √(2n)."""
-    target = scene.target
-    inflated = ExactPosterior(target, choose_sampled(target), inflate=True).density()
-    assert inflated.dimension == density.dimension + 1
-    x, n = target.centre + target.root @ place, target.measured
-    chi2, priors = target.data(x), float(np.sum(target.prior_rows(x) ** 2))
-    for ln_f in (-0.2, 0.0, 0.1):
-        w = np.append(place, ln_f * np.sqrt(2.0 * n))
-        expected = -0.5 * (chi2 * np.exp(-2.0 * ln_f) + priors + ln_f**2) - n * ln_f
-        value, gradient = inflated.value_and_gradient(w)
-        assert value == pytest.approx(expected, rel=ROUNDING)
-        slope = (chi2 * np.exp(-2.0 * ln_f) - ln_f - n) / np.sqrt(2.0 * n)
-        assert gradient[-1] == pytest.approx(slope, rel=1e-9)
-    at_one = inflated.value_and_gradient(np.append(place, 0.0))[1][:-1]
-    # Two programs: counts are alike to 1e-13, residuals to N/σ = 1000 times that; each element is a sum of thousands.
-    np.testing.assert_allclose(at_one, density.value_and_gradient(place)[1], rtol=0, atol=2e-9)
+def test_parameters_of_the_errors_are_coordinates_of_it(scene: Scene) -> None:
+    """−2 ln p with a scale s: χ²/s² + 2 (n − n_F) ln s, by hand, at the fit of all other parameters."""
+    model = with_noise(scene.result.model, scale="all")
+    start = np.append(scene.result.values, 1.0)
+    result = fit(Likelihood.of(scene.result.calset, model), start=start).judged()
+    target = Target(result)
+    density = ExactPosterior(target, choose_sampled(target)).density()
+    assert density.dimension == len(scene.target.free) + 1
+    value, error = result.value("noise.scale")
+    chi2 = value**2 * result.expansion.data  # with the errors as stated
+    ln_p = []
+    for away in (-3.0, 0.0, 3.0):
+        w = np.zeros(density.dimension)
+        w[target.names.index("noise.scale")] = away
+        at = np.linalg.solve(target.root, target.covariance[:, target.names.index("noise.scale")]) / error
+        value_here, _ = density.value_and_gradient(away * at)
+        s = value + away * error
+        ln_p.append(value_here + 0.5 * (chi2 / s**2 + 2.0 * target.measured * np.log(s)))
+    assert np.ptp(ln_p) < 1e-6 * abs(ln_p[0])

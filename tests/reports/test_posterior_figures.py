@@ -17,7 +17,7 @@ from walop_jax.reports.posterior_figures import (
     trace_figure,
 )
 
-NAMES, UNITS = ("half1.wedge", "sky.depolarisation", "noise.ln_f"), ("deg", "", "")
+NAMES, UNITS = ("half1.wedge", "sky.depolarisation", "noise.scale"), ("deg", "", "")
 
 
 @pytest.fixture(scope="module")

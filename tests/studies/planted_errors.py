@@ -147,8 +147,8 @@ ERRORS = (
     planted("calibration/calibration.py", "flags[~(condition <= HIGH_CROSSTALK)]", "flags[condition <= HIGH_CROSSTALK]",
             "calibration/test_calibration.py"),
     # posterior
-    planted("posterior/surrogate.py", "np.exp(-2.0 * self.ln_f_unit * z[:, -1])",
-            "np.exp(-self.ln_f_unit * z[:, -1])", "posterior/test_surrogate.py"),
+    planted("posterior/surrogate.py", "(self.scales(z) / (self.scale or 1.0)) ** -2",
+            "(self.scales(z) / (self.scale or 1.0)) ** -1", "posterior/test_surrogate.py"),
     planted("posterior/surrogate.py", "self.centre + z[:, : self.along.shape[1]] @ self.along.T + s",
             "self.centre + z[:, : self.along.shape[1]] @ self.along.T - s", "posterior/test_surrogate.py"),
     planted("posterior/surrogate.py", "mean + np.sqrt(variance) * rng", "mean + variance * rng",
