@@ -353,7 +353,7 @@ def test_example_of_a_model_file():
 
     lines = [line for line in section("files", "MODEL.toml").splitlines() if line.startswith("    ")]
     text = "\n".join(line.removeprefix("    ") for line in lines)
-    assert set(tomllib.loads(text)) == {"model", "effects", "parameters"}
+    assert set(tomllib.loads(text)) == {"model", "effects", "noise", "parameters"}
     made = model_without_data("WALOP-SOUTH", text)
     assert made.effect_names == ("clp_wobble", "blemish")
     assert made["half2.plate.mgf2"].tie == "half1.plate.mgf2"

@@ -1,4 +1,4 @@
-"""The likelihood of data whose errors have parameters, against the multivariate normal distribution by linear algebra."""
+"""The likelihood of data whose errors have parameters, against the normal distribution by linear algebra."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from walop_jax.likelihood.flux import Sharing
 from walop_jax.likelihood.noise import NoiseTerms, log_variance, noise_expansion, variance_ratio
+from walop_jax.model.compiled import array
 from walop_jax.model.noise import Noise
 
 KINDS = ("clp", "clp", "moon", "flux", "steady", "steady")
@@ -101,8 +102,8 @@ def scene(request: pytest.FixtureRequest) -> Scene:
 def noise_at(groups: tuple[tuple[str, ...], tuple[str, ...]], values: Float[np.ndarray, " t"]) -> Noise:
     scales, fractions = groups
     return Noise(
-        scale=np.array(values[: len(scales)]),
-        fraction=np.array(values[len(scales) :]),
+        scale=array(np.array(values[: len(scales)])),
+        fraction=array(np.array(values[len(scales) :])),
         scales=scales,
         fractions=fractions,
     )
