@@ -15,7 +15,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, Effect
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.simulation.simulate import simulate
 
 

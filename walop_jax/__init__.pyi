@@ -49,6 +49,7 @@ from walop_jax.likelihood.likelihood import Likelihood as Likelihood
 from walop_jax.model.effects import EFFECTS as EFFECTS
 from walop_jax.model.effects import Effect as Effect
 from walop_jax.model.effects import effect_by_name as effect_by_name
+from walop_jax.model.effects.in_models import with_effects as with_effects
 from walop_jax.model.elements.base import Element as Element
 from walop_jax.model.instrument import Instrument as Instrument
 from walop_jax.model.noise import with_noise as with_noise
@@ -56,7 +57,6 @@ from walop_jax.model.parameters import Scalar as Scalar
 from walop_jax.model.parameters import number as number
 from walop_jax.model.parameters import param as param
 from walop_jax.model.specification import Model as Model
-from walop_jax.model.specification import with_effects as with_effects
 from walop_jax.posterior.result import Options as Options
 from walop_jax.posterior.result import arviz_of_fit as _to_arviz  # noqa: F401
 from walop_jax.posterior.run import Run as Run

@@ -17,9 +17,9 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import of_structure
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.settings import Settings
-from walop_jax.fit.base_model import model_for
 from walop_jax.fit.minimise import RESULTS
 from walop_jax.fit.model_file import model_without_data, render
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Structure
 from walop_jax.io.errors import DataError

@@ -24,7 +24,7 @@ from walop_jax.fit.verdict import Verdict
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import in_ascii
 from walop_jax.model.effects import Context, Described
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 
 NAN = float("nan")
 

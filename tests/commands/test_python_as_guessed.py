@@ -37,8 +37,11 @@ def test_a_model_shows_its_parameters(fitted):
     row = table[table["NAME"] == "half1.wedge"][0]
     assert (row["STATE"], row["UNIT"], row["START"]) == ("fixed", "rad", -0.23)
     assert (row["PRIOR_MEAN"], row["PRIOR_SIGMA"]) == (-0.23, 0.001)
-    assert "half1.wedge" in model.summary()
-    assert "<table>" in model._repr_html_()
+    assert repr(model).startswith("Model of WALOP-SOUTH: ")
+    assert len(repr(model)) < 100
+    written = walop.model(fitted.calset)
+    assert "half1.wedge" in written.summary()
+    assert "<table>" in written._repr_html_()
 
 
 def test_intensities_print_as_a_line(fitted):

@@ -15,8 +15,8 @@ from walop_jax.calibration.product import write_calibration
 from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.science.field_points import field_points
 
 from .conftest import FittedSet

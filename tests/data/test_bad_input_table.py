@@ -21,7 +21,8 @@ from handmade_set import Handmade
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.base_model import base_model, model_for
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.search import check_identifiable
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood

@@ -41,7 +41,7 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described
-from walop_jax.model.specification import effect_context
+from walop_jax.model.effects.in_models import effect_context
 
 Examined = Callable[..., Examination]
 Spaces = dict[tuple[tuple[str, ...], tuple[str, ...]], ScoreSpace]

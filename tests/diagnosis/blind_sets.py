@@ -29,8 +29,8 @@ from walop_jax.fit.refit import fit
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Effect
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 

@@ -28,8 +28,8 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 

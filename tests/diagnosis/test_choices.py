@@ -17,9 +17,10 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.effects import OtherDescription, effect_by_name
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.ray import Conditions, Ray
-from walop_jax.model.specification import Model, effect_context, with_effects
+from walop_jax.model.specification import Model
 from walop_jax.simulation.observing_plan import NARROW_BANDS
 from walop_jax.simulation.simulate import simulate
 

@@ -30,7 +30,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.effects.change import Change
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.posterior.run import Run
 from walop_jax.simulation.simulate import effect_from_text, simulate
 

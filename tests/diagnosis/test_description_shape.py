@@ -14,7 +14,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
 from walop_jax.diagnosis.class_product import averaged, only_a_class
 from walop_jax.diagnosis.discrepancy import ambiguities, shape_changes
-from walop_jax.fit.base_model import base_model, model_like
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.model_of_set import model_like
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import Context, Described, Deviations

@@ -18,8 +18,8 @@ from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.score import effective_trials, local_p
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.simulate import simulate
 
 CHOSEN = (

@@ -20,7 +20,7 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm, effect_by_name
-from walop_jax.model.specification import model_without
+from walop_jax.model.effects.in_models import model_without
 from walop_jax.simulation.simulate import simulate
 
 ZERO, WOBBLE, LEAKAGE, DRIFT = map(

@@ -21,8 +21,8 @@ from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
 from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import build, nominal_instrument
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate
 

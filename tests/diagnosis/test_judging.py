@@ -23,7 +23,7 @@ from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import simulate
 

@@ -13,7 +13,7 @@ from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
 UNIT = np.repeat(["clp", "moon", "standard"], 100)

@@ -34,9 +34,9 @@ from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.verdict import Hidden
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.specification import with_effects
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
 

@@ -15,7 +15,7 @@ from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.synonyms import _same_to_the_data
 from walop_jax.model.effects import EFFECTS, Context, Described
-from walop_jax.model.specification import effect_context
+from walop_jax.model.effects.in_models import effect_context
 
 TURNED = "retardance v behind polariser * r2", "retardance v behind collimator * r2"
 LOST = "depolarisation of polariser * r2", "depolarisation behind collimator * r2"

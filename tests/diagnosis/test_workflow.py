@@ -20,7 +20,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, refit
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS
-from walop_jax.model.specification import effect_context
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.simulation.simulate import simulate
 
 

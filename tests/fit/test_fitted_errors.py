@@ -15,9 +15,10 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.base_model import base_model, model_for, model_like
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.many import refit_many
 from walop_jax.fit.model_file import render
+from walop_jax.fit.model_of_set import model_for, model_like
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.forward import Forward
 from walop_jax.likelihood.likelihood import Likelihood

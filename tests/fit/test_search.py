@@ -19,8 +19,8 @@ from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood, OpticsUsed
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import build
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
 # One wave is 0.62 µm / (n_e − n_o): 1.38892 − 1.37714 of MgF2 (Dodge 1984), 1.55211 − 1.54305 of quartz (Ghosh 1999).

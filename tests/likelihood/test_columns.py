@@ -15,8 +15,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.change import NoSlotError
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.parameters import values_of
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
 SENTENCES = (

@@ -21,11 +21,11 @@ from walop_jax.likelihood import optics
 from walop_jax.likelihood.forward import Forward
 from walop_jax.model import light, materials
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
 STEP = 1e-4  # of the scales of the parameters

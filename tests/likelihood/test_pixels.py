@@ -31,7 +31,7 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.blemish import Blemish
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.simulation.simulate import simulate
 
 SIDE = 72

@@ -20,7 +20,6 @@ from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import MeasuredPoints, PointReader, bytes_per_point, thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
-from walop_jax.sky.moon import moon_sky
 
 SIDE = 9
 RUN = frame_run(SIDE)
@@ -132,18 +131,6 @@ def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
     one, other = refit(streaming, model), refit(calset, model)
     assert one.converged
     assert one.chi2 == pytest.approx(other.chi2, rel=1e-12)
-
-
-def test_moon_sky_is_that_of_the_ephemeris(calset):
-    e = calset.exposures
-    moon = np.flatnonzero(e.kind == "moon")
-    likelihood = Likelihood.of(calset, base_model(calset, throughput_degree=2))
-    read = PointReader(calset, likelihood.plan, likelihood.model.template)
-    x, y = GRID.xy(0, 5)
-    sky = read.sky_polarisation(x, y)
-    expected = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], calset.site, x, y)
-    np.testing.assert_array_equal(sky[:, moon], np.stack(expected, axis=-1))
-    assert (np.delete(sky, moon, axis=1) == 0).all()
 
 
 def test_a_fault_in_the_file_stops_the_pass(calset, streaming):

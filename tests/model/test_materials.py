@@ -10,8 +10,8 @@ from one_arm import one_arm
 import walop_jax as walop
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings
-from walop_jax.fit.base_model import model_for
 from walop_jax.fit.minimise import minimise
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError

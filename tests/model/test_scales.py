@@ -14,9 +14,9 @@ from walop_jax.model.effects.base import Context
 from walop_jax.model.effects.blemish import Blemish
 from walop_jax.model.effects.change import AtPoint, patched
 from walop_jax.model.effects.free_form import SMOOTH, FreeForm
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.ray import Ray
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.observing_plan import ObservingPlan
 
 SOUTH_LIKE = 'name = "OTHER"\nlike = "WALOP-SOUTH"\n'

@@ -19,10 +19,10 @@ from walop_jax.likelihood.columns import columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
 from walop_jax.model.sources import Sight, Standards, mean_over_band
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values
 

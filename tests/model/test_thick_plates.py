@@ -14,8 +14,8 @@ import walop_jax as walop
 from walop_jax.calibration.matrix import matrix_draws
 from walop_jax.data.records import FilterCurve
 from walop_jax.data.settings import Settings, builtin_filter
-from walop_jax.fit.base_model import model_for
 from walop_jax.fit.model_file import model_without_data
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.instrument import build, nominal_instrument

@@ -17,7 +17,7 @@ from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.nights import equations, night_file
 from walop_jax.nights.equations import data_hash, model_hash, night_equations, with_candidates_of
 from walop_jax.nights.together import check_together, together

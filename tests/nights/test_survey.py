@@ -16,12 +16,14 @@ import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.merge import merge_calibration_sets
-from walop_jax.fit.base_model import base_model, model_for, model_like
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.model_of_set import model_for, model_like
 from walop_jax.fit.refit import fit
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Deviations, effect_by_name
-from walop_jax.model.specification import effect_context, make_model, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
+from walop_jax.model.specification import make_model
 from walop_jax.nights import making, night_file, stacking, survey_folder
 from walop_jax.nights.equations import night_equations
 from walop_jax.nights.stacking import stack

@@ -18,10 +18,10 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.model import light, materials, plates
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.elements import geometry
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate, truth_values
 

@@ -27,8 +27,8 @@ from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
 from walop_jax.likelihood.flux import Sharing
 from walop_jax.likelihood.likelihood import prior_rows
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.plans.available import Available, Costs, with_stops
 from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
 from walop_jax.plans.exposures import Illumination, _with, candidates, fewer_points, information_of

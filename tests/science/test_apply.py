@@ -19,8 +19,9 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.effects.blemish import Blemish
+from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import nominal_instrument
-from walop_jax.model.specification import effect_context, make_model, with_effects
+from walop_jax.model.specification import make_model
 from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.colours import COOL, HOT

@@ -19,12 +19,13 @@ from walop_jax.calibration.certify import certify
 from walop_jax.calibration.product import validity, write_calibration
 from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
-from walop_jax.fit.base_model import base_model, model_for
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.refit import fit, refit, with_honest_errors
 from walop_jax.fit.verdict import Doubt, Quality, Structure
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.science.epoch import compared, epoch, fit_like
 from walop_jax.simulation.simulate import simulate
 

@@ -25,9 +25,10 @@ from walop_jax.instruments.description import shipped
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described, effect_by_name
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import make_model, with_effects
+from walop_jax.model.specification import make_model
 from walop_jax.simulation.observing_plan import (
     NARROW_BANDS,
     ObservingPlan,

@@ -18,7 +18,14 @@ from science.truth import TrueInstrument
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import Site
 from walop_jax.io.errors import DataError
-from walop_jax.sky.moon import body_direction, local_sidereal_time, moon_sky, offset_direction, rayleigh_sky
+from walop_jax.sky.moon import (
+    SkyOfExposures,
+    body_direction,
+    local_sidereal_time,
+    moon_sky,
+    offset_direction,
+    rayleigh_sky,
+)
 from walop_jax.sky.position_angles import sky_to_instrument
 
 CENTRE = (np.zeros(1), np.zeros(1))
@@ -204,3 +211,44 @@ def test_offsets_are_those_of_astropy_and_sidereal_time_is_within_arc_seconds():
         theirs = Time(mjd, format="mjd", scale="ut1").sidereal_time("mean", 20.8 * units.deg).deg
     away = np.mod(local_sidereal_time(mjd, 20.8) - theirs + 180.0, 360.0) - 180.0
     assert np.abs(away).max() < 5.0 / 3600.0
+
+
+@pytest.fixture(scope="module")
+def night():
+    return read_calibration_set("fits_data/walop_south_small.fits")
+
+
+def test_the_sky_of_a_list_of_exposures_is_moonlit_in_those_of_the_moon(night):
+    e, (x, y) = night.exposures, np.array([[-0.1, 0.0, 0.2], [0.1, 0.0, -0.2]])
+    moon = np.flatnonzero(e.kind == "moon")
+    sky = SkyOfExposures(e, night.site).polarisation(x, y)
+    expected = moon_sky(e.mjd[moon], e.ra[moon], e.dec[moon], e.rotator[moon], night.site, x, y)
+    np.testing.assert_array_equal(sky[:, moon], np.stack(expected, axis=-1))
+    assert (np.delete(sky, moon, axis=1) == 0).all()
+
+
+def test_the_sky_follows_changed_times_places_and_kinds(night):
+    """Time and site of a set may be replaced (as when one asks whether they were recorded wrongly): no sky is kept."""
+    e, site, (x, y) = night.exposures, night.site, np.array([[0.0, 0.2], [0.0, -0.2]])
+    moon = np.flatnonzero(e.kind == "moon")
+    late, south = (
+        dataclasses.replace(e, mjd=e.mjd + 0.1),
+        dataclasses.replace(site, latitude=-site.latitude),
+    )
+    before = SkyOfExposures(e, site).polarisation(x, y)
+    for exposures, place in ((late, site), (e, south), (late, south)):
+        sky = SkyOfExposures(exposures, place).polarisation(x, y)
+        times = exposures.mjd[moon]
+        expected = moon_sky(times, e.ra[moon], e.dec[moon], e.rotator[moon], place, x, y)
+        np.testing.assert_array_equal(sky[:, moon], np.stack(expected, axis=-1))
+        assert (sky[:, moon] != before[:, moon]).all()
+    lamps = dataclasses.replace(e, kind=np.where(e.kind == "moon", "lamp", e.kind))
+    assert (SkyOfExposures(lamps, site).polarisation(x, y) == 0).all()
+
+
+def test_a_sky_without_the_moon_needs_no_ephemeris(night):
+    nowhere = Site("", np.nan, np.nan, np.nan)
+    e = night.exposures[night.exposures.kind != "moon"]
+    assert (SkyOfExposures(e, nowhere).polarisation(*CENTRE) == 0).all()
+    with pytest.raises(DataError, match="site is not known"):
+        SkyOfExposures(night.exposures, nowhere).polarisation(*CENTRE)

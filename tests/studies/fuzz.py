@@ -43,8 +43,9 @@ from study_options import options_of  # noqa: E402
 from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
-from walop_jax.fit.base_model import base_model, model_for  # noqa: E402
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.model_file import render  # noqa: E402
+from walop_jax.fit.model_of_set import model_for  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.instrument import nominal_instrument  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402

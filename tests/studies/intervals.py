@@ -49,9 +49,9 @@ from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.likelihood.compressed import compressed  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.effects import effect_by_name  # noqa: E402
+from walop_jax.model.effects.in_models import with_effects  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
 from walop_jax.model.planning import plan_for_settings  # noqa: E402
-from walop_jax.model.specification import with_effects  # noqa: E402
 from walop_jax.science.apply import apply  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 from walop_jax.science.colours import COOL, HOT  # noqa: E402

@@ -43,8 +43,8 @@ from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes  # noqa: E4
 from walop_jax.diagnosis.score import ScoreSpace, local_p, separations  # noqa: E402
 from walop_jax.fit.refit import FitResult, refit  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
+from walop_jax.model.effects.in_models import effect_context  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
-from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 

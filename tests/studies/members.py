@@ -27,7 +27,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
 
 TOLD, KINDS = "depolarisation of polariser * r2", ("depol", "retard", "diatt", "added")
 

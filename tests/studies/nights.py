@@ -44,8 +44,8 @@ from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import fit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
+from walop_jax.model.effects.in_models import effect_context  # noqa: E402
 from walop_jax.model.laws import YEAR, Law  # noqa: E402
-from walop_jax.model.specification import effect_context  # noqa: E402
 from walop_jax.nights import break_search, breaks, changes  # noqa: E402
 from walop_jax.nights.equations import night_equations  # noqa: E402
 from walop_jax.nights.night_file import read_nights, write_nights  # noqa: E402

@@ -43,7 +43,7 @@ from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.cameras import with_floor  # noqa: E402
-from walop_jax.model.specification import effect_context  # noqa: E402
+from walop_jax.model.effects.in_models import effect_context  # noqa: E402
 from walop_jax.plans.available import Available  # noqa: E402
 from walop_jax.plans.criteria import NAMED, criterion_by_name, field_errors  # noqa: E402
 from walop_jax.plans.exposures import Candidates, Polarised, candidates  # noqa: E402

@@ -16,8 +16,8 @@ from walop_jax.data.settings import Settings
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.model.effects import EFFECTS, Described, FreeForm, OtherDescription
 from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.specification import effect_context
 
 if TYPE_CHECKING:
     from studies.sealed import Sealed

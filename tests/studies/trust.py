@@ -43,9 +43,9 @@ from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model import light  # noqa: E402
 from walop_jax.model.effects import EFFECTS  # noqa: E402
+from walop_jax.model.effects.in_models import with_effects  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
 from walop_jax.model.planning import plan_for_settings  # noqa: E402
-from walop_jax.model.specification import with_effects  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
 WRONG = 3.0

@@ -48,11 +48,12 @@ from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.dependence import left_behind, needs
 from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import Model, Vector, effect_context
+from walop_jax.model.specification import Model, Vector
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult

@@ -30,10 +30,10 @@ from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light
 from walop_jax.model.effects import Change, Effect, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context
+from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.effects.numbers import OF_POLARISER
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import effect_context
 
 if TYPE_CHECKING:
     from walop_jax.calibration.calibration import Calibration
@@ -138,12 +138,12 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     """The effects of `Hidden.acts` by number, as far as the catalogue of the calibration has them."""
     hidden, model = calibration.hidden, calibration.model
     context = effect_context(model.template, calibration.exposures)
-    names = {kind.name for kind in model.catalogue}
+    names = {kind.name for kind in known_effects(model)}
     effects = {}
     for number, mistake in enumerate(() if hidden is None else hidden.mistakes):
         values: dict[str, Any] = json.loads(mistake.acts) if mistake.acts else {}
         if (name := values.pop("effect", "")) in names:
-            effects[number] = effect_by_name(name, model.catalogue).of(context, **values)
+            effects[number] = effect_by_name(name, known_effects(model)).of(context, **values)
     return effects
 
 

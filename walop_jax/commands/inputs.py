@@ -109,7 +109,7 @@ def set_and_model(
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
     from walop_jax import Instrument, Model
-    from walop_jax.fit.base_model import model_for
+    from walop_jax.fit.model_of_set import model_for
 
     text = ""
     if model is not None and not isinstance(model, Model):

@@ -22,7 +22,7 @@ from walop_jax.commands.products import Effects, InstrumentLike, catalogue_of, d
 
 if TYPE_CHECKING:
     from walop_jax import CalibrationSet
-    from walop_jax.fit.base_model import ModelFile
+    from walop_jax.fit.model_of_set import ModelFile
 
 
 OPTIONS = {
@@ -56,8 +56,8 @@ def model(
 
     >>> text = walop.model(instrument="WALOP-NORTH")  # doctest: +SKIP
     """
-    from walop_jax.fit.base_model import ModelFile, model_for
     from walop_jax.fit.model_file import effects_text, model_without_data, render
+    from walop_jax.fit.model_of_set import ModelFile, model_for
     from walop_jax.model.instrument import nominal_instrument
 
     catalogue = catalogue_of(effects)
@@ -73,4 +73,5 @@ def model(
     options = given(instrument=instrument, effects=effects, elements=job.elements)
     refit = typed("refit", *several(calsets), *options, "--model", output, "-o", "RUN")
     model_file = ModelFile(base, text, None if output is None else Path(output))
-    return Outcome(model_file, text=text if output is None else None, next=(refit,) if calsets else ())
+    text = text if output is None else model_file.display().title
+    return Outcome(model_file, text=text, next=(refit,) if calsets else ())

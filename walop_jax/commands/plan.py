@@ -121,6 +121,7 @@ def plan(
     """
     from walop_jax import ObservingPlan
     from walop_jax.data.user_tables import read_input_table
+    from walop_jax.model.effects.in_models import known_effects
     from walop_jax.plans.available import Available, plan_beside
     from walop_jax.plans.criteria import check_wishes, effects_alike
     from walop_jax.plans.plan import plan_exposures
@@ -138,7 +139,7 @@ def plan(
             raise UsageError("one calibration can be added to: the RUN, or that of --after", "after")
         after, available = available, ""
     prior = None if after is None else calibration_of(after, effects)
-    catalogue = catalogue_of(effects) if effects is not None or prior is None else prior.model.catalogue
+    catalogue = catalogue_of(effects) if effects is not None or prior is None else known_effects(prior.model)
     alike = tuple(several(apart or ()))
     if criterion == "apart" and not alike:
         if prior is None:

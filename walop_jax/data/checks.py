@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.data import plausible
-from walop_jax.data.kinds import KINDS, POLARISER, WAVELENGTHS
+from walop_jax.data.kinds import EPHEMERIS_MJD, KINDS, POLARISER, WAVELENGTHS
 from walop_jax.data.records import Exposures, FilterCurve, Points, Site, Sources
 from walop_jax.data.schema import EXPOSURES, POINTS, SOURCES, TURN, check
 from walop_jax.data.settings import BUILTIN_FILTERS, PHOTOMETRIC_BANDS, same_filters, single_wavelength
@@ -23,9 +23,6 @@ from walop_jax.io.errors import nearest, rows_text
 _ANY_FIELD = 90.0  # deg
 _LONGEST_NAME = 32
 _LIKE = 0.85  # of two names, for "did you mean"
-
-EPHEMERIS_MJD = (15020.0, 88069.0)
-"""Range of astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100)."""
 
 
 def field_limit(instrument: str) -> float:

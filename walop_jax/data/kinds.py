@@ -38,3 +38,6 @@ PREFIX = re.compile(r"[A-Z][A-Z0-9_]*")
 
 WAVELENGTHS = (0.2, 20.0)
 """Light of a camera (µm), from the ultraviolet to the thermal infrared."""
+
+EPHEMERIS_MJD = (15020.0, 88069.0)
+"""Range of astropy's built-in ephemeris (ERFA `moon98`, the years 1900 to 2100)."""

@@ -42,6 +42,7 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, patched
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.in_models import effects_of
 
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 LINEAR = 0.01  # relative error of the evidence of a linear step
@@ -59,7 +60,7 @@ def classes_of(
     """
     fit, model, design = laid.fit, laid.fit.model, laid.design
     groups, classes = [name for name in added if name not in model.effect_names], list[ClassOf]()
-    for effect in model.effects:
+    for effect in effects_of(model):
         at = design.columns_of(model.positions(effect.name))
         if effect.name in added and not effect.kind.is_structural() and len(at):
             change, sums = signature(fit, effect.name), tuple(map(tuple, effect.first_order(model.template)))
@@ -341,7 +342,7 @@ class LinearStep:
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
         """True if a model can include all sentences."""
         sentences = sentences_in(sums)
-        stated = {text for effect in self.laid.fit.model.effects for text in effect.stated}
+        stated = {text for effect in effects_of(self.laid.fit.model) for text in effect.stated}
         if not all(map(self.laid.columns.has, sums)) or not all(
             s.kind in KINDS and all(isinstance(f, str) for f in s.factors) and s.text not in stated
             for s in sentences

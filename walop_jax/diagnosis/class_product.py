@@ -31,8 +31,9 @@ from walop_jax.io.text import per_cent, some, two_digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
 from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.in_models import effect_context, with_effects, with_sentences
 from walop_jax.model.effects.optics import GENERATORS
-from walop_jax.model.specification import Model, effect_context, with_effects, with_sentences
+from walop_jax.model.specification import Model
 
 Sum = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""

@@ -58,6 +58,7 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.progress import Stage
 from walop_jax.io.text import per_cent, per_cent_range, two_digits, two_digits_range
 from walop_jax.model.effects import EffectKind
+from walop_jax.model.effects.in_models import known_effects
 
 MANY_SHAPES = 8
 """Shapes of an effect above which one of them, of the median size, stands for all in what it does to the matrix."""
@@ -307,7 +308,7 @@ def detection_limits(
     """
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset
-    catalogue = result.model.catalogue if catalogue is None else catalogue
+    catalogue = known_effects(result.model) if catalogue is None else catalogue
     listed = hypotheses(catalogue, template, calset.exposures, len(calset.points))
     result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))

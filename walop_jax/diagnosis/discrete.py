@@ -50,7 +50,8 @@ from walop_jax.diagnosis.readings import (
     with_block,
     with_part,
 )
-from walop_jax.fit.base_model import base_model, model_like
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.model_of_set import model_like
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.io.errors import DataError
@@ -58,9 +59,10 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives
 from walop_jax.model.effects import Effect, OtherDescription
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import values_of
-from walop_jax.model.specification import Model, with_effects
+from walop_jax.model.specification import Model
 
 _POINTS = 16  # field points that are looked at
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best

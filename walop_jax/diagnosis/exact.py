@@ -38,9 +38,10 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
+from walop_jax.model.effects.in_models import effect_context, model_without, with_effects, with_sentences
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import leaves, values_of
-from walop_jax.model.specification import Model, effect_context, model_without, with_effects, with_sentences
+from walop_jax.model.specification import Model
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,6 +33,7 @@ from walop_jax.model.effects.cameras import POWERS
 from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.effects.numbers import OF_QU
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, GROUPS
 from walop_jax.model.elements.geometry import PupilMapping
@@ -40,7 +41,6 @@ from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import hours_of
 from walop_jax.model.slots import acts
-from walop_jax.model.specification import effect_context
 from walop_jax.sky.nights import first_of_nights
 
 ROUNDED = 1e-4  # hours, of times in descriptions

@@ -41,8 +41,8 @@ from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
 from walop_jax.io.text import beside, with_error
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.laws import YEAR
-from walop_jax.model.specification import effect_context
 
 ALIKE = 25.0  # in χ², within which conditions are reported together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
@@ -301,7 +301,7 @@ def _asked_effects(design: Design) -> tuple[Probe, ...]:
     fit, template = design.fit, design.fit.model.template
     context = effect_context(template, fit.calset.exposures)
     excluded = {*fit.model.effect_names, *_ASKED_OTHERWISE}
-    asked = (kind for kind in fit.model.catalogue if not set(kind.shape) & _PLACES)
+    asked = (kind for kind in known_effects(fit.model) if not set(kind.shape) & _PLACES)
     kinds = [kind for kind in asked if kind.name not in excluded]
     return tuple(probes(applicable(kinds, context, template), context))
 

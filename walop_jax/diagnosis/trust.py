@@ -68,6 +68,7 @@ from walop_jax.likelihood.compressed import compressed
 from walop_jax.likelihood.frames import PixelExpansion
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects.in_models import known_effects
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
@@ -161,7 +162,9 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     give the number of independent trials, as in a diagnosis, so that both correct p alike.
     """
     fit, calset, basis = design.fit, design.fit.calset, design.projector.basis
-    listed = grammar.hypotheses(fit.model.catalogue, fit.model.template, calset.exposures, len(calset.points))
+    listed = grammar.hypotheses(
+        known_effects(fit.model), fit.model.template, calset.exposures, len(calset.points)
+    )
     probes = listed.beside(fit.model.effect_names)
     numbers = (item.single for item in (singles.items if singles else ()))
     known = {n.candidate.name: n.candidate.columns for n in numbers if n.probe}

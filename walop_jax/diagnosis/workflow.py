@@ -50,6 +50,7 @@ from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, EffectKind
+from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model
 
@@ -77,7 +78,7 @@ def diagnose(
     began = time.perf_counter()
     tell = progress or (lambda text: None)
     model = model or base_model(calset)
-    catalogue = model.catalogue if catalogue is None else catalogue
+    catalogue = known_effects(model) if catalogue is None else catalogue
     calset = in_field_points(calset, model, tell, pixel_structure)
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
     sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)

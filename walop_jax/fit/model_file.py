@@ -15,12 +15,13 @@ from walop_jax.io.text import parse_toml
 from walop_jax.io.toml import Reader, Table
 from walop_jax.model.effects import EFFECTS, Context, EffectKind, effect_by_name
 from walop_jax.model.effects.catalogue import entries, is_own
+from walop_jax.model.effects.in_models import effects_of, known_effects, with_effects
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
 from walop_jax.model.noise import noise_choices, with_noise
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import Standards
-from walop_jax.model.specification import Model, make_model, with_effects
+from walop_jax.model.specification import GAUGE, Model, make_model
 
 TABLES = ("model", "effects", "catalogue", "noise", "parameters", "law")
 PARAMETER: Table = {
@@ -52,14 +53,14 @@ class ModelTable:
 def header_of(model: Model) -> ModelTable:
     """Choices that decide which parameters a model has."""
     instrument = model.template
-    choices = {effect.name: effect.choices() for effect in model.effects}
+    choices = {effect.name: effect.choices() for effect in effects_of(model)}
     return ModelTable(
         instrument=model.name,
         plates=instrument.plates,
         throughput_degree=instrument.throughput.degree,
         effects=model.effect_names,
         choices={name: values for name, values in choices.items() if values},
-        entries={effect.name: effect.entry.table for effect in model.effects if is_own(effect)},
+        entries={effect.name: effect.entry.table for effect in effects_of(model) if is_own(effect)},
         noise=noise_choices(instrument),
     )
 
@@ -124,7 +125,7 @@ def parse(text: str, build: Callable[[ModelTable], Model]) -> Model:
         changes[name] = _changes(parameter, entry)
     changed = tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in model.parameters)
     laws = {name: law.document() for name, law in laws_of(content.get("law", {})).items()}
-    kinds = [kind.name for kind in model.catalogue]
+    kinds = [kind.name for kind in known_effects(model)]
     for name in laws:
         if not fnmatch.filter(model.names, name) and re.split("[.#]", name)[0] not in kinds:
             raise unknown_name("parameter of [law]", name, model.names)
@@ -172,7 +173,6 @@ def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 Catalogue = Sequence[EffectKind]
-GAUGE = "throughput.n0.p00"
 
 
 def model_without_data(
@@ -213,7 +213,7 @@ def with_effects_of(model: Model, header: ModelTable, context: Context) -> Model
     effects: list[Any] = []
     for name in header.effects:
         choices: Mapping[str, Any] = header.choices.get(name, {})
-        kind = effect_by_name(name, model.catalogue)
+        kind = effect_by_name(name, known_effects(model))
         effects.append(kind.of(context, **choices) if choices else kind)
     model = with_effects(model, effects, context) if effects else model
     return with_noise(model, **header.noise) if header.noise else model

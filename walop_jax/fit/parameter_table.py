@@ -11,7 +11,6 @@ from jaxtyping import Float
 from walop_jax.io.display import Display, Result
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
-from walop_jax.model.effects import Deviations
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.specification import THROUGHPUT, Model, Vector
 
@@ -90,11 +89,15 @@ def parameter_table(model: Model, values: Vector, sigma: Vector) -> Any:
 
 
 def parameter_rows(model: Model, values: Vector, sigma: Vector) -> tuple[tuple[str, ...], ...]:
-    """Rows below `HEAD`, without terms of the throughput and deviations; no start where it is the mean of the prior."""
+    """Rows below `HEAD`, without terms of the throughput and unlisted effects.
+
+    There is no start where it is the mean of the prior.
+    """
+    unlisted = {THROUGHPUT, *(effect.name for effect in model.template.effects if effect.unlisted)}
     idle = unconstrained(model, sigma)
     rows = []
     for p, value, s in zip(model.parameters, values, sigma, strict=True):
-        if p.part in (THROUGHPUT, Deviations.name):
+        if p.part in unlisted:
             continue
         prior = "" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1])
         same = p.prior is not None and p.prior[0] == p.start
@@ -110,10 +113,11 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
     hidden = len(model.positions(THROUGHPUT))
     idle = unconstrained(model, sigma)
     notes = [f"{hidden} throughput terms not shown; to_table() has them"] if hidden else []
-    if deviations := len(model.positions(Deviations.name)):
-        notes.append(
-            f"errors include {deviations} changes of polarisation that the data would not show (deviations)"
-        )
+    for effect in model.template.effects:
+        if effect.unlisted:
+            notes.append(
+                f"errors include {len(model.positions(effect.name))} {effect.unlisted} ({effect.name})"
+            )
     if idle:
         listed = f": {', '.join(idle)}" if len(idle) <= MOST_LISTED else " (marked in to_table())"
         notes.append(f"{len(idle)} parameters are constrained only by their priors{listed}")

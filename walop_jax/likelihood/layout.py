@@ -8,7 +8,6 @@ points there are.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator
 from functools import cached_property
@@ -20,11 +19,9 @@ from walop_jax.data.merge import without_frames
 from walop_jax.data.records import (
     Block,
     CalibrationSet,
-    Exposures,
     FilterCurve,
     Intensities,
     Points,
-    Site,
     Sources,
 )
 from walop_jax.likelihood import limits
@@ -44,7 +41,7 @@ from walop_jax.model.parameters import values_of
 from walop_jax.model.plan import Plan, with_median
 from walop_jax.model.planning import outgrown, plan_for
 from walop_jax.model.specification import Model
-from walop_jax.sky.moon import body_direction, rayleigh_sky
+from walop_jax.sky.moon import SkyOfExposures
 
 THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 
@@ -257,8 +254,6 @@ def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "
 
 # ----------------------------------------------------------------------------------------------------- the measurements
 
-Vector = Float[np.ndarray, " n"]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PointReader:
@@ -274,6 +269,10 @@ class PointReader:
     instrument: Instrument
     mirrored: bool = False
     noise: Noise | None = None
+
+    @cached_property
+    def _sky(self) -> SkyOfExposures:
+        return SkyOfExposures(self.calset.exposures, self.calset.site)
 
     def batches(self, start: int, stop: int, size: int) -> list[PointData]:
         """The points `start:stop` in batches of `size`, the last one filled up with its last point, of weight 0."""
@@ -298,10 +297,10 @@ class PointReader:
             y=array(block.y),
             counts=array(np.where(block.used[:, :, None], block.counts, 0.0)),
             weight=array(weight),
-            sky=array(self.sky_polarisation(block.x, block.y)),
+            sky=array(self._sky.polarisation(block.x, block.y)),
             source=array(block.source),
             band=array(band),
-            opposite_sky=array(self.sky_polarisation(-block.x, -block.y)) if self.mirrored else None,
+            opposite_sky=array(self._sky.polarisation(-block.x, -block.y)) if self.mirrored else None,
         )
         fields = fields_of_stars(self.calset.sources)
         return data._replace(stars=array(self._stars(data, fields))) if len(fields) else data
@@ -327,23 +326,6 @@ class PointReader:
         change = np.moveaxis(share * counts[..., None], -1, 0)
         change = project_flux(change, counts, np.asarray(self.plan.exposures.flux_known), shared)
         return of_low_rank(np.moveaxis(change, 0, -1))
-
-    @cached_property
-    def _moon(self) -> tuple[np.ndarray, Vector, Vector]:
-        """Rows of the exposures of the Moon sky, and the positions of the Moon then."""
-        e: Exposures = self.calset.exposures
-        rows = np.flatnonzero(e.direct("moon"))
-        return rows, *_moon_at(tuple(e.mjd[rows].tolist()), self.calset.site)
-
-    def sky_polarisation(self, x: Vector, y: Vector) -> Float[np.ndarray, "p e 2"]:
-        """(q, u) in the ICS of the Moon sky for δ = 1 at field points; 0 in exposures of other kinds."""
-        e: Exposures = self.calset.exposures
-        sky = np.zeros((len(x), len(e), 2))
-        rows, ra, dec = self._moon
-        if rows.size:
-            pair = rayleigh_sky(ra, dec, e.ra[rows], e.dec[rows], e.rotator[rows], x, y)
-            sky[:, rows] = np.stack(pair, axis=-1)
-        return sky
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -382,9 +364,3 @@ class MeasuredPoints:
         """A field of the point data of all points in one array, without the padding: for sets that memory can hold."""
         arrays = [np.asarray(getattr(batch, field)) for batch in self]
         return np.concatenate(arrays)[: self.layout.points]
-
-
-@functools.lru_cache(maxsize=32)
-def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Vector, Vector]:
-    """Direction of the Moon, kept: the same set is brought together with many models."""
-    return body_direction("moon", np.array(mjd), site) if mjd else (np.zeros(0), np.zeros(0))

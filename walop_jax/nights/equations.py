@@ -33,8 +33,9 @@ from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.catalogue import applies
+from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import Parameter, leaves
-from walop_jax.model.specification import Model, effect_context
+from walop_jax.model.specification import Model
 from walop_jax.nights.algebra import Matrix, Vector
 from walop_jax.nights.together import EffectAmplitude, Night, source_of
 from walop_jax.sky.moon import local_sidereal_time
@@ -195,7 +196,9 @@ def night_equations(
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
             beyond, census = {}, terms.census
         else:
-            beyond = candidates_of(model, subset.exposures, model.catalogue) if changes is None else changes
+            beyond = (
+                candidates_of(model, subset.exposures, known_effects(model)) if changes is None else changes
+            )
             chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
             census = likelihood.census
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):

@@ -21,9 +21,10 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.base_model import model_like
+from walop_jax.fit.model_of_set import model_like
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood.workers import mapped
+from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
     Candidates,
@@ -142,7 +143,7 @@ class Maker:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self._candidates:
-            self._candidates[key] = candidates_of(model, calset.exposures, model.catalogue)
+            self._candidates[key] = candidates_of(model, calset.exposures, known_effects(model))
         return self._candidates[key]
 
 

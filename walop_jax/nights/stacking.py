@@ -28,9 +28,9 @@ from walop_jax.io.names import NIGHTS, PRODUCT
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import check_input, parse_toml, read_text
 from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.specification import effect_context
 from walop_jax.nights.algebra import Laws, OfUnits, Solution, UndeterminedError
 from walop_jax.nights.break_search import find as breaks_of
 from walop_jax.nights.breaks import solved

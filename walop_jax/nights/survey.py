@@ -37,8 +37,8 @@ from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import per_cent, value_and_error
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.model.laws import Law
-from walop_jax.model.specification import effect_context, with_effects
 from walop_jax.nights.algebra import Matrix, Solution, Vector
 from walop_jax.nights.breaks import Break, among_globals
 from walop_jax.nights.changes import scan
@@ -283,7 +283,10 @@ class Survey(Drawn):
                 what = f"{p.name} is one shape of its effect, and the model has another"
                 raise fail(what, advice="put the effect into the model file and fit the nights again")
             if p.part not in model.effect_names:
-                groups, (group, member) = effect_by_name(p.part, model.catalogue).probes(context), p.shape
+                groups, (group, member) = (
+                    effect_by_name(p.part, known_effects(model)).probes(context),
+                    p.shape,
+                )
                 model = with_effects(model, [groups[group][member]], context)
         values, old = model.start, [model.index(name) for name in like.model.names]
         values[old] = like.values

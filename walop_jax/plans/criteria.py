@@ -36,6 +36,7 @@ from walop_jax.io.names import DIAGNOSIS
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.likelihood.inverses import root_of, square_root
 from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.parameters import check_names
 from walop_jax.plans.exposures import Candidates
 
@@ -205,7 +206,7 @@ def _apart(found: Candidates) -> Criterion:
         raise ValueError("give two or more effects to be distinguished, and the size of one: NAME=VALUE")
     base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
     size = np.zeros(len(names))
-    shapes = {effect: effect_by_name(effect, found.model.catalogue).shape for effect in effects}
+    shapes = {effect: effect_by_name(effect, known_effects(found.model)).shape for effect in effects}
     for effect, i in ((effect, i) for effect, places in of.items() for i in places):
         p = found.model.parameters[found.model.index(names[i])]
         size[i] = 0.0 if names[i].split(".")[1] in shapes[effect] else p.start

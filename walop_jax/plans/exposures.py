@@ -36,9 +36,10 @@ from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
+from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.sources import MoonSky
-from walop_jax.model.specification import Model, effect_context, with_effects
+from walop_jax.model.specification import Model
 from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
 from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
 from walop_jax.simulation import simulate as simulation
@@ -186,11 +187,11 @@ def _with(
     for item in given:
         effect = item
         if isinstance(item, str) and "=" in item:
-            effect = simulation.effect_from_text(item, context, model.catalogue)
+            effect = simulation.effect_from_text(item, context, known_effects(model))
         alone = isinstance(effect, str)
         name = effect.strip() if isinstance(effect, str) else effect.name
         extended = with_effects(extended, (name if alone else effect,), context)
-        kind = effect_by_name(name, model.catalogue)
+        kind = effect_by_name(name, known_effects(model))
         if kind.is_structural():
             what = f"{name} is there or it is not, and has no size that could be planned for"
             raise ValueError(f"{what}; leave it out")

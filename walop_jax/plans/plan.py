@@ -32,6 +32,7 @@ from walop_jax.io.text import in_its_unit
 from walop_jax.io.text import rounded as digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind
+from walop_jax.model.effects.in_models import known_effects
 from walop_jax.plans import criteria, needs, optimal
 from walop_jax.plans.available import Available, CandidateExposure, with_stops
 from walop_jax.plans.criteria import Criterion, FieldErrors
@@ -159,7 +160,7 @@ def plan_from(
     of_both = experiment.known, total
     before, after = (none if field is None else field.error(covariance(m)) for m in of_both)
     taken = *had, plan.exposures()
-    lacks = tuple(_lacking(plan, found.model.catalogue, taken, after))
+    lacks = tuple(_lacking(plan, known_effects(found.model), taken, after))
     open_ends = [str(finding) for finding in about_exposures(*taken)]
     return ExposurePlan(
         minutes=minutes,

@@ -16,7 +16,7 @@ from walop_jax.calibration.product import read_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.clipped import read_clipped
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.base_model import model_for
+from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.parameter_table import Fitted
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
@@ -28,7 +28,8 @@ from walop_jax.io.text import per_cent
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
-from walop_jax.model.specification import Model, Vector, model_without
+from walop_jax.model.effects.in_models import model_without
+from walop_jax.model.specification import Model, Vector
 from walop_jax.posterior.draws import A_MEAN, read_groups
 
 SAME_FIT = 0.05  # standard errors

@@ -37,7 +37,8 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
-from walop_jax.fit.base_model import SKY_AND_STARS, model_like
+from walop_jax.fit.base_model import SKY_AND_STARS
+from walop_jax.fit.model_of_set import model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import NO_STRUCTURE
 from walop_jax.io.display import Display, Displayed
@@ -45,6 +46,7 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import probability, two_digits, value_and_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.conventions import matrix_elements
+from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
@@ -282,7 +284,7 @@ def same_standards(old: Model, new: Model) -> list[str]:
 def added_amplitudes(old: Model, new: Model) -> list[str]:
     """Names of free parameters in which effects of the new model that the old one lacks are linear at zero."""
     effects = set(new.effect_names) - set(old.effect_names)
-    shapes = {kind.name: kind.shape for kind in new.catalogue}
+    shapes = {kind.name: kind.shape for kind in known_effects(new)}
     free = [new.parameters[i] for i in new.free]
     leaf = {p.name: p.name.removeprefix(f"{p.part}.").split(".")[0] for p in free}
     return [p.name for p in free if p.part in effects and leaf[p.name] not in shapes.get(p.part, ())]

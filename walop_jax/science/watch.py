@@ -37,7 +37,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.science import instrument_changes as alarms
 from walop_jax.science import places
 from walop_jax.science import star_residuals as residuals
@@ -107,7 +107,7 @@ def with_rivals(calibration: Calibration) -> Calibration:
     covariance: at neutral, as good as certain."""
     context = effect_context(calibration.model.template, calibration.exposures)
     model = calibration.model
-    for kind in (kind for kind in model.catalogue if kind.watched):
+    for kind in (kind for kind in known_effects(model) if kind.watched):
         try:
             model = with_effects(model, [kind.neutral(context)], context)
         except ValueError:

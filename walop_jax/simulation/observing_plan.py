@@ -28,10 +28,10 @@ from walop_jax.io.errors import PathLike, errors_naming, nearest
 from walop_jax.io.text import parse_toml, read_text
 from walop_jax.io.toml import OUT, Reader
 from walop_jax.model.effects.base import Context
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, as_designed, nominal_instrument
 from walop_jax.model.parameters import check_names, unknown_name
-from walop_jax.model.specification import effect_context
 from walop_jax.simulation.polariser_angles import USUAL_ANGLES, angles_of
 from walop_jax.simulation.polariser_angles import polariser_turn as polariser_turn
 from walop_jax.sky.moon import body_direction, local_sidereal_time, offset_direction

@@ -21,6 +21,8 @@ North and east at a field point are those of the field centre, carried there by 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -28,13 +30,48 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.data.checks import EPHEMERIS_MJD
-from walop_jax.data.records import Site
+from walop_jax.data.kinds import EPHEMERIS_MJD
+from walop_jax.data.records import Exposures, Site
 from walop_jax.io.errors import fail
 from walop_jax.sky.position_angles import sky_to_instrument
 
 Values = Float[np.ndarray, " e"]
 """One of every exposure; angles in degrees, times in UTC days (MJD)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SkyOfExposures:
+    """The sky of a list of exposures seen from a site: moonlit in those of the full Moon, unpolarised in all others.
+
+    The direction of the Moon is worked out when the first sky is asked for, and only if there are exposures of it. It
+    is no column of the exposures: whoever replaces their times, or the site, would have to replace that column too.
+    """
+
+    exposures: Exposures
+    site: Site
+
+    @functools.cached_property
+    def _moonlit(self) -> tuple[np.ndarray, Values, Values]:
+        """Rows of the exposures of the full Moon, and the direction of the Moon then."""
+        rows = np.flatnonzero(self.exposures.direct("moon"))
+        return rows, *_moon_at(tuple(self.exposures.mjd[rows].tolist()), self.site)
+
+    def polarisation(
+        self, x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]
+    ) -> Float[np.ndarray, "p e 2"]:
+        """q and u (instrument frame) at field points (deg), for δ = 1. Raises `DataError` as `moon_sky` does."""
+        e, sky = self.exposures, np.zeros((len(x), len(self.exposures), 2))
+        rows, ra, dec = self._moonlit
+        if rows.size:
+            pair = rayleigh_sky(ra, dec, e.ra[rows], e.dec[rows], e.rotator[rows], x, y)
+            sky[:, rows] = np.stack(pair, axis=-1)
+        return sky
+
+
+@functools.lru_cache(maxsize=32)
+def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Values, Values]:
+    """Direction of the Moon, kept: the same set is brought together with many models."""
+    return body_direction("moon", np.array(mjd), site) if mjd else (np.zeros(0), np.zeros(0))
 
 
 def moon_sky(

@@ -15,7 +15,8 @@ from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.io.errors import DataError
 from walop_jax.model.effects import EFFECTS, Described, effect_by_name
 from walop_jax.model.effects.catalogue import catalogue_with
-from walop_jax.model.specification import effect_context, make_model, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
+from walop_jax.model.specification import make_model
 
 MODEL = make_model("WALOP-SOUTH", builders.south(standards=scenes.STARS)).change(
     "half1.efficiency", start=0.9985

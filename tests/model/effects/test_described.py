@@ -21,6 +21,7 @@ from walop_jax.model.dependence import left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN, factor
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.effects.optics import ADDED, GENERATORS, generator, matrix_of
 from walop_jax.model.elements.simple import AddedPolarisation
 from walop_jax.model.instrument import nominal_instrument
@@ -28,7 +29,7 @@ from walop_jax.model.parameters import NAME
 from walop_jax.model.planning import exposure_arrays
 from walop_jax.model.ray import Ray
 from walop_jax.model.sources import Sight
-from walop_jax.model.specification import make_model, with_effects
+from walop_jax.model.specification import make_model
 
 
 def said(*sentences, values):

@@ -13,8 +13,8 @@ from numpy.polynomial.legendre import legval
 from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.model.effects import EFFECTS, FreeForm, effect_by_name, in_order
 from walop_jax.model.effects.free_form import BLOCKS
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.parameters import leaves
-from walop_jax.model.specification import with_effects
 
 FIELD = 0.3  # half width of the field (deg): the argument of the polynomials is x / FIELD
 

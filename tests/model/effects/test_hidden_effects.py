@@ -8,7 +8,7 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.model.effects import Context, effect_by_name
-from walop_jax.model.specification import effect_context, with_effects
+from walop_jax.model.effects.in_models import effect_context, with_effects
 
 
 def fit(path, *names: str, start=()) -> FitResult:

@@ -9,7 +9,7 @@ from walop_jax.fit.model_file import model_without_data
 from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.effects.base import Context
 from walop_jax.model.effects.catalogue import entries
-from walop_jax.model.specification import with_effects
+from walop_jax.model.effects.in_models import with_effects
 
 ENTRY = {
     "about": "A plate of another thickness", "equation": "d = thickness", "source": "here", "revealed_by": "x",

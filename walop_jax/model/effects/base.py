@@ -56,7 +56,8 @@ class Effect(Component):
     into one effect. `one_sided` names amplitudes that physics keeps above neutral; `over_field` is true for an
     effect visible only in several field points, `watched` for one that may change from night to night and that `watch`
     looks for in stars; `reference` is its source; `said` are its changes (`change`),
-    empty for an effect beyond them.
+    empty for an effect beyond them. `unlisted` says what its parameters are if there are too many of them to be listed
+    in print; it is empty for an effect whose parameters are listed.
 
     >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
     'hwp1_axis'
@@ -72,6 +73,7 @@ class Effect(Component):
     separated_by: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     said: ClassVar[tuple[str, ...]] = ()
+    unlisted: ClassVar[str] = ""
 
     @abc.abstractmethod
     def patch(self, instrument: Instrument) -> Instrument:

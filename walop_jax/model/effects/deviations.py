@@ -69,6 +69,7 @@ class Deviations(Effect):
     sentences: tuple[str, ...] = eqx.field(static=True, default=(), converter=tuple)
 
     name: ClassVar[str] = "deviations"
+    unlisted: ClassVar[str] = "changes of polarisation that the data would not show"
     starts = ()
     reference: ClassVar[str] = SOURCE
     revealed_by: ClassVar[str] = "nothing: data that show them would have given another description"
