@@ -11,7 +11,7 @@ Full turn    Light behind the polariser is the same half a turn later: every sec
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,9 +19,10 @@ from walop_jax.data.inspection import FEW_ANGLES, about_exposures, sees_the_sky
 from walop_jax.data.records import Exposures
 from walop_jax.plans.available import CandidateExposure
 from walop_jax.plans.exposures import Candidates
+from walop_jax.plans.optimal import Weights
 
-Required = Mapping[tuple[int, tuple[float, ...]], float]
-"""Numbers of exposures by choice and place (`available.CandidateExposure`)."""
+Required = Weights
+"""Numbers of exposures by choice and number in it (`available.CandidateExposure`)."""
 
 _DIRECTION = 180.0  # deg after which light behind the polariser is the same
 _APART = 3.0  # deg: directions that are nearer are one
@@ -55,7 +56,7 @@ def _of_the_sky(found: Candidates, had: Sequence[Exposures]) -> Required:
         cost = choice.seconds + costs.of(choice.kind)
         if choice.kind == "moon":
             patches = range(min(_PATCHES, len(choice.stops)))
-            options.append((cost * len(patches), {(number, (float(i),)): 1.0 for i in patches}))
+            options.append((cost * len(patches), {(number, i): 1.0 for i in patches}))
         if choice.kind == "standard":
             stars = [stop.number for stop in choice.stops]
             # A field of zero polarisation follows the standards.
@@ -63,7 +64,7 @@ def _of_the_sky(found: Candidates, had: Sequence[Exposures]) -> Required:
             polarised = [i for i, k in enumerate(stars) if plan.unpolarised <= k < plan.standards]
             if unpolarised and polarised:
                 pair = unpolarised[0], polarised[0]
-                options.append((cost * len(pair), {(number, (float(i),)): 1.0 for i in pair}))
+                options.append((cost * len(pair), {(number, i): 1.0 for i in pair}))
     return min(options, key=lambda option: option[0], default=(0.0, {}))[1]
 
 
@@ -73,24 +74,29 @@ def _directions(found: Candidates, planned: Required, had: Sequence[Exposures]) 
     if not indoors or found.available.plan.moving or any(e.further for e in had):
         return {}  # which element does the work of the polariser is not known here
     angles = [float(angle) for e in had for angle in e.clp_angle[e.clp_in]]
-    wanted: dict[tuple[int, tuple[float, ...]], float] = {}
-    for number, place in sorted(planned, key=lambda key: -planned[key]):
-        angle = indoors[number].stop(place).polariser_angle if number in indoors else None
+    wanted: dict[tuple[int, int], float] = {}
+    for key in sorted(planned, key=lambda key: -planned[key]):
+        angle = indoors[key[0]].stops[key[1]].polariser_angle if key[0] in indoors else None
         if angle is not None and len(_distinct(angles)) < FEW_ANGLES and _is_new(angle, angles):
             angles.append(angle)
-            wanted[number, place] = 1.0
+            wanted[key] = 1.0
     plain = indoors[number := min(indoors, key=lambda i: (*_plates(indoors[i]), indoors[i].seconds, i))]
+
+    def on_the_grid(angle: float) -> tuple[int, float]:
+        stop = plain.number(angle)
+        return stop, float(plain.stops[stop].polariser_angle or 0.0)
+
     while len(_distinct(angles)) < FEW_ANGLES:
         begin, gap = _widest(angles, _DIRECTION)
-        middle = round(float((begin + 0.5 * gap) % _DIRECTION), 3)
+        middle = (begin + 0.5 * gap) % _DIRECTION
         # Where half a turn later is another exposure the one that is farther from all others spreads them over a turn.
-        angles.append(
-            max((middle, middle + plain.turn - _DIRECTION), key=lambda angle: _farthest(angle, angles))
-        )
-        wanted[number, plain.place(angles[-1])] = 1.0
+        both = (on_the_grid(middle), on_the_grid(middle + plain.turn - _DIRECTION))
+        stop, angle = max(both, key=lambda found: _farthest(found[1], angles))
+        angles.append(angle)
+        wanted[number, stop] = 1.0
     begin, gap = _widest(angles, 360.0)
     if gap > _DIRECTION and plain.turn > _DIRECTION:
-        wanted[number, plain.place(round(float((begin + 0.5 * gap) % 360.0), 3))] = 1.0
+        wanted[number, on_the_grid(begin + 0.5 * gap)[0]] = 1.0
     return wanted
 
 
@@ -127,11 +133,11 @@ def _widest(angles: Sequence[float], turn: float) -> tuple[float, float]:
     return float(ordered[np.argmax(gaps)]), float(gaps.max())
 
 
-def half_a_turn_later(found: Candidates, planned: Required) -> set[tuple[int, tuple[float, ...]]]:
+def half_a_turn_later(found: Candidates, planned: Required) -> set[tuple[int, int]]:
     """Every second direction of the polariser: taken half a turn later the directions lie over a full turn."""
     angles = {}
-    for number, place in planned:
+    for number, stop in planned:
         choice = found.choices[number]
         if choice.kind == "clp" and choice.turn == _DIRECTION:
-            angles[number, place] = choice.stop(place).polariser_angle or 0.0
+            angles[number, stop] = choice.stops[stop].polariser_angle or 0.0
     return set(sorted(angles, key=lambda key: (angles[key], key))[1::2])
