@@ -244,6 +244,7 @@ def test_what_a_fit_in_memory_left_undecided(tmp_path):
     [
         (("--separate", "RUN", "--goal", 3), "leave it out beside --separate, which takes all from its RUN"),
         (("--separate", "RUN", "--after", "RUN"), "leave it out beside --separate"),
+        (("--separate", "RUN", "--criterion", "mean"), "leave it out beside --separate"),
         (("--minutes", 10), "give a plan file, an instrument or a RUN"),
     ],
 )

@@ -11,7 +11,7 @@ from walop_jax.data.records import Exposures
 from walop_jax.model.effects import EFFECTS
 from walop_jax.plans.available import Available, CandidateExposure
 from walop_jax.plans.exposures import Candidates
-from walop_jax.plans.needs import _directions, half_a_turn_later
+from walop_jax.plans.needs import _directions, _of_the_sky, half_a_turn_later
 from walop_jax.science.field_accuracy import known_in_half
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
 
@@ -63,6 +63,20 @@ def test_every_second_direction_is_taken_half_a_turn_later():
     choice = polarised(360.0)
     planned = {(0, choice.number(angle)): 1.0 for angle in angles}
     assert half_a_turn_later(candidates_of(choice), planned) == set()
+
+
+def test_the_sky_of_a_go_is_what_takes_least_time_beside_the_plan():
+    """By hand: two Moon patches take 240 s, two standards 300; where a polarised one is planned the other takes 150."""
+    moon, star = (
+        CandidateExposure(kind, "SDSS-r", {}, 60.0, tuple(Stop(None, kind=kind, number=i) for i in range(4)))
+        for kind in ("moon", "standard")
+    )
+    found = candidates_of(moon, star)
+    assert found.available.plan.unpolarised == 2
+    assert set(_of_the_sky(found, {}, [])) == {(0, 0), (0, 1)}
+    assert set(_of_the_sky(found, {(1, 3): 2.0}, [])) == {(1, 0), (1, 3)}
+    assert set(_of_the_sky(found, {(1, 3): 2.0, (0, 2): 1.0}, [])) == {(0, 0), (0, 2)}
+    assert _of_the_sky(found, {}, [ObservingPlan(grid=2).exposures()]) == {}
 
 
 def test_what_only_the_sky_shows_and_what_it_does_to_stars():

@@ -143,7 +143,12 @@ def plan(
     elif words is not None:
         raise UsageError("these are words of a schedule; see --schedule", "words")
     if separate is not None:
-        if given := [n for n, v in (("after", after), ("apart", apart), ("goal", goal)) if v is not None]:
+        wishes = {"after": after, "apart": apart, "goal": goal}
+        wishes |= {
+            "criterion": None if criterion == "worst" else criterion,
+            "draws": None if draws == 20 else draws,
+        }
+        if given := [name for name, wish in wishes.items() if wish is not None]:
             raise UsageError("leave it out beside --separate, which takes all from its RUN", given[0])
         after, available = separate, "" if available is None else available
     elif available is None and after is None:

@@ -5,7 +5,8 @@ The error of p is least with a few angles of the polariser alone. A go asks for 
 shows what acts ahead of the polariser. What a calibration has already, to which the plan adds, counts.
 
 Directions   Those that the best plan uses most; where they are too few, the middles of the widest gaps between them.
-Sky          An unpolarised and a polarised standard, or patches around the Moon; what takes less time.
+Sky          An unpolarised and a polarised standard, or patches around the Moon; what takes less time, where those that
+             the best plan has anyway take none.
 Full turn    Light behind the polariser is the same half a turn later: every second direction is taken there.
 """
 
@@ -40,31 +41,36 @@ def required(found: Candidates, planned: Required, had: Sequence[Exposures]) -> 
     `planned` is the best plan without them. First what a go cannot do without (`calibration.certify.lacks`) and the
     directions, then the former alone.
     """
-    sky, directions = _of_the_sky(found, had), _directions(found, planned, had)
+    sky, directions = _of_the_sky(found, planned, had), _directions(found, planned, had)
     for wanted in ({**sky, **directions}, sky):
         if wanted:
             yield wanted
 
 
-def _of_the_sky(found: Candidates, had: Sequence[Exposures]) -> Required:
-    """One exposure each of an unpolarised and a polarised standard, or of patches around the Moon; nothing if seen."""
+def _of_the_sky(found: Candidates, planned: Required, had: Sequence[Exposures]) -> Required:
+    """One exposure each of an unpolarised and a polarised standard, or of patches around the Moon; nothing if seen.
+
+    Those that are planned anyway cost nothing.
+    """
     if sees_the_sky(*had):
         return {}
     plan, costs = found.available.plan, found.available.costs
     options: list[tuple[float, Required]] = []
     for number, choice in enumerate(found.choices):
-        cost = choice.seconds + costs.of(choice.kind)
+        # Those that are planned first.
+        order = sorted(range(len(choice.stops)), key=lambda i, number=number: (number, i) not in planned)
+        chosen = []
         if choice.kind == "moon":
-            patches = range(min(_PATCHES, len(choice.stops)))
-            options.append((cost * len(patches), {(number, i): 1.0 for i in patches}))
+            chosen = order[:_PATCHES]
         if choice.kind == "standard":
-            stars = [stop.number for stop in choice.stops]
+            stars = [choice.stops[i].number for i in order]
             # A field of zero polarisation follows the standards.
-            unpolarised = [i for i, k in enumerate(stars) if k < plan.unpolarised or k >= plan.standards]
-            polarised = [i for i, k in enumerate(stars) if plan.unpolarised <= k < plan.standards]
-            if unpolarised and polarised:
-                pair = unpolarised[0], polarised[0]
-                options.append((cost * len(pair), {(number, i): 1.0 for i in pair}))
+            unpolarised = [k < plan.unpolarised or k >= plan.standards for k in stars]
+            if len(set(unpolarised)) == 2:
+                chosen = [order[unpolarised.index(kind)] for kind in (True, False)]
+        if chosen:
+            each, wanted = choice.seconds + costs.of(choice.kind), {(number, i): 1.0 for i in chosen}
+            options.append((each * sum(key not in planned for key in wanted), wanted))
     return min(options, key=lambda option: option[0], default=(0.0, {}))[1]
 
 

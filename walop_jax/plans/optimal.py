@@ -51,6 +51,10 @@ GAP = 0.01  # distance from the bound at which the search ends
 _ROUNDS = 40  # of candidates that join and leave
 _POWERS = (8.0, 40.0, 200.0, 1000.0, 5000.0)  # of the mean that stands for the maximum over targets
 _QUICKLY = 2  # of these powers that have a round each, whatever it brings
+_BETTER, _PATIENCE = (
+    0.02,
+    6,
+)  # of the gap: what brings less is idle; rounds in a row after which the search ends
 _STEPS = 300  # of L-BFGS-B in a round
 _SPREAD, _OF_EACH = 96, 3  # candidates that a search begins with: of all families, of each at least
 _TOPS, _OF_FAMILY = 24, 3  # candidates that may join in a round: of all families, of each
@@ -372,24 +376,26 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
     """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
     some = Some(problem, spread(problem))
     share, level = np.full(len(some.keys), 1.0 / len(some.keys)), 0
-    proof, value, weight, at = None, np.inf, share, some
+    proof, value, weight, at, idle = None, np.inf, share, some, 0
     for turn in range(1, _ROUNDS + 1):
         power, each = _POWERS[level], problem.budget / some.costs
         share = some.solved(share, power, gap)
-        here = some.value(each * share)
-        if here < value:
-            value, weight, at = here, each * share, some
-        covariance = some.covariance(each * share)
+        here, covariance = some.value(each * share), some.covariance(each * share)
         shares = multipliers(some, each * share, power)
         bound, gains = bounded(problem, covariance, shares)
-        if proof is None or bound.value(problem.budget) > proof[0].value(problem.budget):
+        new, known = bound.value(problem.budget), 0.0 if proof is None else proof[0].value(problem.budget)
+        better = here < value * (1 - _BETTER * gap) or new > known * (1 + _BETTER * gap)
+        idle = 0 if better else idle + 1
+        if here < value:
+            value, weight, at = here, each * share, some
+        if proof is None or new > known:
             proof = bound, covariance, shares
         least = proof[0].value(problem.budget)
         if progress is not None:
             progress(
                 f"round {turn}: criterion {value:g}, bound {least:g}, gap {100 * (value / least - 1):.2g} %"
             )
-        if value <= least * (1 + gap):
+        if value <= least * (1 + gap) or idle >= _PATIENCE:
             break
         kept = np.flatnonzero(share > _LEAST_WEIGHT)
         some, share = some.only(kept.tolist()), share[kept]
@@ -400,7 +406,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
         some, share = larger, np.append(share, np.full(news, 1e-3))
         share = share / share.sum()
         converged = bound.ratio < (1 + 0.5 * gap) * bound.mean(problem.budget)
-        if converged or not news or level < _QUICKLY or turn % 3 == 0:
+        if converged or not news or level < _QUICKLY or idle:
             level = min(level + 1, len(_POWERS) - 1)
     assert proof is not None
     final, _ = bounded(problem, proof[1], proof[2], finer=True)

@@ -309,7 +309,8 @@ def _for_a_go(
             return alone, {}
     except ValueError as error:
         failure = error
-    for required in needs.required(found, weights.weights, had):
+    # Directions of whole exposures, which lie in few settings; weights may lie in many.
+    for required in needs.required(found, weights.weights if alone is None else alone.weights, had):
         budget = problem.budget - time(required)
         if budget < 0:
             continue
