@@ -1,6 +1,6 @@
 """Are effects that a set cannot tell apart decided by the one or two exposures that are planned for them?
 
-    python tests/studies/separating.py [NAME ...] [--minutes 10] [--noises 3] [--diagnosed 0]
+    python tests/studies/separating.py [NAME ...] [--minutes 40] [--noises 3] [--diagnosed 0]
 
 For each scene a set is simulated with one effect. Its class is that effect and a rival, if a fit of the rival has a χ²
 that is larger by less than 9; with `--diagnosed 1` it is the class that a diagnosis of the set leaves. The exposures
@@ -39,7 +39,7 @@ from walop_jax.plans.separating import DECIDED, ClassOfRun, class_of_run  # noqa
 from walop_jax.simulation.observing_plan import ObservingPlan  # noqa: E402
 
 SOUTH = ObservingPlan(
-    "WALOP-SOUTH", grid=3, standard_grid=2, moon_patches=2, standards=2, unpolarised=1, throughput_degree=1
+    "WALOP-SOUTH", grid=3, standard_grid=2, moon_patches=3, standards=0, unpolarised=0, throughput_degree=1
 )
 SCENES = {
     "axis of the second plate": ("hwp2_axis=0.006", "hwp2_crossing"),
@@ -113,7 +113,7 @@ def scene(name: str, minutes: float, noises: int, diagnosed: bool) -> tuple[int,
 
 def main() -> None:
     """Print the study."""
-    parser = options_of(__doc__, minutes=10.0, noises=3, diagnosed=0)
+    parser = options_of(__doc__, minutes=40.0, noises=3, diagnosed=0)
     parser.add_argument("names", nargs="*", help=f"of: {'; '.join(SCENES)} (default: all)")
     given = parser.parse_args()
     results = [

@@ -8,8 +8,9 @@ worth their changes are dropped.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Collection, Hashable, Iterable
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,7 @@ from walop_jax.plans.optimal import (
 )
 
 _HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
+_FEW = 3  # settings at most with which a search begins, beside that with all of them
 _EXCHANGES, _TRIED = 200, 40  # exchanges, and those tried for each, most promising first
 _PROMISING = 6  # of the candidates that may be added, most promising first, whose criterion is computed
 _SHARPNESS = 20.0  # power of the mean whose slope says which exchanges are promising
@@ -49,7 +51,7 @@ def rounded(
     targets need.
     """
     search = _Whole(experiment.reduced(), plan, required or {}, time or experiment.cost)
-    count = search.exchanged(search.filled(search.first()))
+    count = search.exchanged(min(search.starts(setting), key=search.value))
     while setting is not None:
         used = {setting(key) for key in search.weights(count)}
         trials = [search.without(count, {k for k in search.some.keys if setting(k) == one}) for one in used]
@@ -101,6 +103,22 @@ class _Whole:
         raise ValueError(
             f"the budget, {self.problem.budget:g}, is less than what is required costs: {least:g}"
         )
+
+    def starts(self, setting: Callable[[Key], Hashable] | None) -> Iterator[Weight]:
+        """Plans to begin with: of all candidates with weight, and of the settings that have most of it."""
+        yield self.filled(self.first())
+        if setting is None:
+            return
+        keys = self.some.keys
+        cost = self.weight * self.some.costs
+        total: dict[Hashable, float] = {setting(key): 0.0 for key in keys}
+        for key, of_key in zip(keys, cost, strict=True):
+            total[setting(key)] += float(of_key)
+        order = sorted(total, key=lambda one: -total[one])
+        for few in range(1, min(_FEW, len(order) - 1) + 1):
+            others = {key for key in keys if setting(key) in order[few:]}
+            with contextlib.suppress(ValueError):  # what is required may be all that the budget pays for
+                yield self.filled(self.least, others)
 
     def filled(self, count: Weight, forbidden: Collection[Key] = ()) -> Weight:
         """A plan with the remaining budget spent, one candidate at a time."""
