@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from own_instrument import OWN
+from small_run import small_fit
 
+from walop_jax.commands.inputs import save
 from walop_jax.commands.limits import limits
 from walop_jax.commands.plan import plan as plan_command
 from walop_jax.commands.products import design_of
@@ -230,5 +232,33 @@ def test_effects_of_ones_own_are_told_apart(call, tmp_path, monkeypatch):
 def test_what_a_fit_in_memory_left_undecided(tmp_path):
     """It has no diagnosis; asking it for one ended in a TypeError."""
     result = refit(simulate(ObservingPlan(grid=3, moon_patches=2, standards=3), seed=1).calset).judged()
-    with pytest.raises(DataError, match="no diagnosis; run diagnose first, or name the effects with --apart"):
-        plan_command(after=result, available="", criterion="apart")
+    for wish in ({"after": result, "criterion": "apart"}, {"separate": result}):
+        with pytest.raises(
+            DataError, match="no diagnosis; run diagnose first, or name the effects with --apart"
+        ):
+            plan_command("", **wish)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--separate", "RUN", "--goal", 3), "leave it out beside --separate, which takes all from its RUN"),
+        (("--separate", "RUN", "--after", "RUN"), "leave it out beside --separate"),
+        (("--separate", "RUN", "--criterion", "mean"), "leave it out beside --separate"),
+        (("--minutes", 10), "give a plan file, an instrument or a RUN"),
+    ],
+)
+def test_wishes_that_contradict_a_class(call, words, message):
+    done = call("plan", *words)
+    assert done.exit_code == 2
+    assert message in done.stderr
+
+
+def test_a_run_without_a_class_says_so(call, tmp_path, monkeypatch):
+    """Exit code 1 and what to do; nothing is planned."""
+    monkeypatch.chdir(tmp_path)
+    save(small_fit(), "RUN")
+    Path("RUN/diagnosis.json").write_text('{"verdict": "consistent", "steps": []}')
+    done = call("plan", "--separate", "RUN")
+    assert done.exit_code == 1
+    assert "the diagnosis left no effects that look alike" in done.stderr

@@ -199,7 +199,7 @@ ERRORS = (
     # plans
     planted("plans/optimal.py", "return self.here**2 / (self.known", "return self.here**2 / (0.0 * self.known",
             "plans/test_optimal.py"),
-    planted("plans/families.py", "bend += (0.5 if", "bend += (0.0 if", "plans/test_optimal.py"),
+    planted("plans/separating.py", "= step[len(base) :]", "= 2.0 * step[len(base) :]", "plans/test_separating.py"),
     # commands
     planted("commands/refit.py", "    if result.converged:\n", "    if True:\n",
             "commands/test_refit_run.py"),

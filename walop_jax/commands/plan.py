@@ -36,7 +36,7 @@ PLAN, INSTRUMENT = "plan.toml", "instrument.toml"
 OPTIONS = {
     "available": Option(
         "Candidate exposures: a plan file, an instrument by name, or the RUN to add to.",
-        metavar="PLAN.toml|INSTRUMENT|RUN",
+        metavar="[PLAN.toml|INSTRUMENT|RUN]",
         kind=Path,
         placed=True,
     ),
@@ -66,6 +66,11 @@ OPTIONS = {
         metavar="NAME=VALUE",
         kind=list[str],
     ),
+    "separate": Option(
+        "A diagnosis that left a class: plan one exposure, or two that differ, that separate its members.",
+        metavar="RUN",
+        kind=Path,
+    ),
     "draws": Option("Instruments, drawn from the priors, that the plan is made for.", kind=int, least=1),
     "schedule": Option(
         "Write the exposures as a schedule of the survey (format v4).", metavar="FILE.json", kind=Path
@@ -93,7 +98,7 @@ OPTIONS = {
 )
 def plan(
     job: Job,
-    available: ObservingPlan | Product,
+    available: ObservingPlan | Product | None = None,
     *,
     minutes: float = 30.0,
     candidates: Any = None,
@@ -101,6 +106,7 @@ def plan(
     goal: float | None = None,
     after: Any = None,
     apart: Any = None,
+    separate: Any = None,
     draws: int = 20,
     effects: Effects = None,
     schedule: PathLike | None = None,
@@ -110,10 +116,13 @@ def plan(
     """Plan the calibration exposures of a night: those that make the error of p smallest where it is largest.
 
     Candidate exposures are given by a plan file (see `walop-jax docs files`): filters, settings of the calibration
-    plate, Moon patches, standards, exposure times, costs. The polariser may stand at any angle; so may the plate, of an
-    INSTRUMENT, of a RUN, or where the file says so. Printed are the exposures in order, the errors that they promise,
-    and a proven bound that no plan of the same time undercuts. RUN/plan.toml is the plan for `simulate` and
-    `limits`, RUN/plan.json holds all numbers; --schedule writes it for the telescope.
+    plate, Moon patches, standards, exposure times, costs. The polariser may stand at every multiple of 1.5°; the plate
+    of an INSTRUMENT, of a RUN, or where the file says so, at every multiple of 7.5°. Printed are the exposures in
+    order, the errors that they promise, and a bound that no plan of the same time undercuts. RUN/plan.toml is the plan
+    for `simulate` and `limits`, RUN/plan.json holds all numbers; --schedule writes it for the telescope.
+
+    `--separate RUN` plans what a diagnosis left undecided: one exposure, or two that differ, repeated for the time
+    there is, for which the least expected Δχ² between any two members of the class is largest. Each pair is printed.
 
     In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
 
@@ -126,6 +135,7 @@ def plan(
     from walop_jax.plans.criteria import check_wishes, effects_alike
     from walop_jax.plans.plan import plan_exposures
     from walop_jax.plans.schedule import scheduled
+    from walop_jax.plans.separating import class_of_run
     from walop_jax.simulation.observing_plan import plan_text
 
     check_wishes(minutes, goal, draws)
@@ -133,6 +143,18 @@ def plan(
         check_output(schedule, overwrite=job.overwrite)
     elif words is not None:
         raise UsageError("these are words of a schedule; see --schedule", "words")
+    if separate is not None:
+        wishes = {"after": after, "apart": apart, "goal": goal}
+        wishes |= {
+            "criterion": None if criterion == "worst" else criterion,
+            "draws": None if draws == 20 else draws,
+        }
+        if given := [name for name, wish in wishes.items() if wish is not None]:
+            raise UsageError("leave it out beside --separate, which takes all from its RUN", given[0])
+        after, available = separate, "" if available is None else available
+    elif available is None and after is None:
+        raise UsageError("give a plan file, an instrument or a RUN", "available")
+    available = "" if available is None else available
     is_plan = isinstance(available, ObservingPlan) or available == ""
     if not is_plan and (not isinstance(available, str | os.PathLike) or is_product(available)):
         if after is not None:
@@ -145,6 +167,7 @@ def plan(
         if prior is None:
             raise UsageError("give the effects to be separated, or a RUN of diagnose", "apart")
         alike = effects_alike(after, prior)
+    undecided = None if separate is None or prior is None else class_of_run(after, prior)
     if candidates is None and available == "" and prior is not None:
         available = plan_beside(prior)
     table = Path(str(criterion))
@@ -157,7 +180,7 @@ def plan(
     with repeated(job.progress) as say:
         best = functools.partial(
             plan_exposures, minutes=minutes, criterion=chosen, known=prior, goal=goal, draws=draws, apart=alike,
-            catalogue=catalogue, seed=job.seed, progress=say,
+            separate=undecided, catalogue=catalogue, seed=job.seed, progress=say,
         )  # fmt: skip
         planned = best(possible)
         if possible.doubts(planned.observing_plan):

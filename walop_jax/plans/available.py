@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.kinds import CALIBRATION_PLATE
@@ -55,17 +55,18 @@ class Costs:
         return float(getattr(self, kind))
 
 
-Place = Float[np.ndarray, " d"] | tuple[float, ...]
 ANY = "any"  # angle of the calibration plate
 PLATE_TURN = 180.0  # deg after which the plate repeats itself
+STEP, PLATE_STEP = 1.5, 7.5
+"""Steps (deg) of the grid: angles of the polariser, and of the plate where it may stand at any.
+
+Both hold 22.5, 45 and 90, at which cameras are dark and the information of an exposure varies quickest."""
 
 
 class CandidateExposure(NamedTuple):
-    """Exposures that differ in the angle of the polariser, and of the plate if `free`, or in which of `stops` they are.
+    """Exposures that differ in the angle of the polariser, or in the Moon patch or standard: each one of `stops`.
 
-    Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal. The
-    place of an exposure is the phase (rad) of its angle θ in that turn; where the plate is free, that of the direction
-    2α − θ in which light is polarised behind the plate at α, with which counts change quickly, and that of α.
+    Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal.
     """
 
     kind: str
@@ -74,39 +75,27 @@ class CandidateExposure(NamedTuple):
     seconds: float
     stops: tuple[Stop, ...]
     turn: float = 180.0
-    free: bool = False
 
     @property
     def setting(self) -> tuple[Any, ...]:
         """Settings that have to be changed for another choice."""
-        return (self.filter, self.free, *self.positions.values())
+        return (self.filter, *self.positions.values())
 
-    def stop(self, place: Place, times: int = 1) -> Stop:
-        """The stop at phases (rad) of polariser and plate, or of that number in the list."""
+    def number(self, angle: float) -> int:
+        """The stop that is nearest to an angle (deg) of the polariser."""
+        return round(angle % self.turn / STEP) % len(self.stops)
+
+    def over(self, turn: float) -> CandidateExposure:
+        """The same with the polariser on the grid over a turn (deg)."""
         if self.kind != "clp":
-            return dataclasses.replace(self.stops[round(place[0])], times=times)
-        plate, angle = self.stops[0].plate, place[0] / (2 * np.pi) * self.turn
-        if self.free:
-            plate = round(float(place[1] / (2 * np.pi) * PLATE_TURN) % PLATE_TURN, 3)
-            angle = 2 * plate - angle
-        angle = round(float(angle % self.turn), 3)
-        return dataclasses.replace(self.stops[0], polariser_angle=angle, plate=plate, times=times)
-
-    def place(self, angle: float, plate: float = 22.5) -> tuple[float, ...]:
-        """The phases (rad) of angles (deg) of the polariser, and of the plate where it is free."""
-        direction = 2 * plate - angle if self.free else angle
-        phase = 2 * np.pi * (direction % self.turn) / self.turn
-        return (phase, 2 * np.pi * (plate % PLATE_TURN) / PLATE_TURN) if self.free else (phase,)
-
-    def with_plate(self, angle: float) -> CandidateExposure:
-        """The same with the plate at an angle (deg)."""
-        stops = (dataclasses.replace(self.stops[0], plate=angle),)
-        return self._replace(positions={**self.positions, CALIBRATION_PLATE: angle}, stops=stops, free=False)
+            return self
+        angles = (STEP * np.arange(round(turn / STEP))).tolist()
+        stops = tuple(dataclasses.replace(self.stops[0], polariser_angle=angle) for angle in angles)
+        return self._replace(stops=stops, turn=turn)
 
     def text(self) -> str:
         """In a few words."""
         stands = {p: "out" if a is None else f"{a:g}°" for p, a in self.positions.items()}
-        stands |= {CALIBRATION_PLATE: ANY} if self.free else {}
         places = (f"{p} {where}" for p, where in stands.items())
         return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
 
@@ -118,13 +107,13 @@ def with_stops(plan: ObservingPlan, stops: Iterable[Stop], **changes: Any) -> Ob
 
 @dataclasses.dataclass(frozen=True)
 class Available:
-    """Exposures that could be taken: those of an observing plan, at any angle of the polariser; costs and limits.
+    """Exposures that could be taken: those of an observing plan, the polariser at any angle of a grid; costs, limits.
 
     `seconds` are exposure times to choose from, by kind; pointings lower than `altitude` (deg) are left out; `places`
     takes standards at single places of their raster, not at all of them for the cost of one. With `any_plate` the
-    calibration plate may stand at any angle behind the polariser, besides its settings in the plan. Targets must be up
-    in the dark when the sky is first observed, and for `throughout` minutes from then on. Raises ValueError for values
-    that contradict each other.
+    calibration plate may stand at any angle of a grid behind the polariser, besides its settings in the plan. Targets
+    must be up in the dark when the sky is first observed, and for `throughout` minutes from then on. Raises ValueError
+    for values that contradict each other.
     """
 
     plan: ObservingPlan
@@ -183,22 +172,27 @@ class Available:
         for kind, total in (("moon", plan.moon_patches), ("standard", len(plan.star_names))):
             up[kind], remarks = self._up(kind, total)
             notes += remarks
-        candidates, positions = [], {CALIBRATION_PLATE: plan.plate, **plan.moving}
+        candidates, plates = [], tuple(plan.plate)
+        if self.any_plate:
+            grid = (PLATE_STEP * np.arange(round(PLATE_TURN / PLATE_STEP))).tolist()
+            plates += tuple(angle for angle in grid if angle not in plates)
+        positions = {CALIBRATION_PLATE: plates, **plan.moving}
         for name, stops in itertools.product(plan.filter_names, itertools.product(*positions.values())):
             where = dict(zip(positions, stops, strict=True))
             moving = {prefix: a for prefix, a in where.items() if prefix != CALIBRATION_PLATE}
             for kind in EXPOSED:
                 if kind == "clp" and plan.design.polariser is None:
                     continue
+                if kind != "clp" and stops[0] not in plan.plate:
+                    continue  # any angle of the plate is for light behind the polariser
                 for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
                     angle = 0.0 if kind == "clp" else None
                     blank = Stop(angle, name, stops[0], moving, kind=kind, seconds=seconds)
                     indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
                     members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
                     if members:
-                        candidates.append(CandidateExposure(kind, name, where, seconds, members))
-                    if kind == "clp" and self.any_plate and stops[0] == plan.plate[0]:
-                        candidates.append(candidates[-1]._replace(free=True))
+                        one = CandidateExposure(kind, name, where, seconds, members)
+                        candidates.append(one.over(one.turn))
         return tuple(candidates), tuple(notes)
 
     def _members(self, blank: Stop, numbers: tuple[int, ...]) -> Iterator[Stop]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,7 @@ class Criterion:
     name: str
     what: str
     unit: str
-    targets: Float[np.ndarray, "r k f q"]
+    targets: Float[np.ndarray, "r k n q"]
     inverse: bool = False
     blocks: Float[np.ndarray, "b f n"] | None = None
 
@@ -200,30 +200,46 @@ def _of_stars(found: Candidates, table: InputTable) -> Criterion:
 
 
 def _apart(found: Candidates) -> Criterion:
-    names, effects = np.array(found.names), found.effects
-    of = {effect: np.flatnonzero(np.char.startswith(names, f"{effect}.")) for effect in effects}
+    effects, of = found.effects, amplitudes_of(found, found.effects)
     if len(effects) < 2 or not any(effects.values()):
         raise ValueError("give two or more effects to be distinguished, and the size of one: NAME=VALUE")
-    base = np.setdiff1d(np.arange(len(names)), np.concatenate(list(of.values())))
-    size = np.zeros(len(names))
-    shapes = {effect: effect_by_name(effect, known_effects(found.model)).shape for effect in effects}
-    for effect, i in ((effect, i) for effect, places in of.items() for i in places):
-        p = found.model.parameters[found.model.index(names[i])]
-        size[i] = 0.0 if names[i].split(".")[1] in shapes[effect] else p.start
-        if size[i] and p.prior is not None:
-            size[i] -= p.prior[0]
+    size = {effect: stated_size(found, effect) for effect in effects if effects[effect]}
+    return apart(found, of, size)
+
+
+def amplitudes_of(found: Candidates, effects: Iterable[str]) -> dict[str, list[int]]:
+    """The places of the numbers of each effect among the parameters of the candidates."""
+    names = np.array(found.names)
+    return {e: np.flatnonzero(np.char.startswith(names, f"{e}.")).tolist() for e in effects}
+
+
+def stated_size(found: Candidates, effect: str) -> Float[np.ndarray, " f"]:
+    """How far an effect is from none, in the parameters of the candidates; its shape is no size."""
+    shape, size = effect_by_name(effect, known_effects(found.model)).shape, np.zeros(len(found.names))
+    for i in amplitudes_of(found, [effect])[effect]:
+        p = found.model.parameters[found.model.index(found.names[i])]
+        if found.names[i].split(".")[1] not in shape:
+            size[i] = p.start - (0.0 if p.prior is None or not p.start else p.prior[0])
+    return size
+
+
+def apart(
+    found: Candidates, of: Mapping[str, Sequence[int]], size: Mapping[str, Float[np.ndarray, " f"]]
+) -> Criterion:
+    """The least distance of all pairs of effects, `of` which the numbers are given; those with a `size` may be true."""
+    base = np.setdiff1d(np.arange(len(found.names)), np.concatenate([list(i) for i in of.values()]))
     widest, blocks = max(map(len, of.values())), []
-    for truth, rival in itertools.permutations(effects, 2):
-        if not effects[truth]:
+    for truth, rival in itertools.permutations(of, 2):
+        if truth not in size:
             continue
-        block = np.zeros((len(names), len(base) + 1 + widest))
+        block = np.zeros((len(found.names), len(base) + 1 + widest))
         block[base, np.arange(len(base))] = 1.0
-        block[of[truth], len(base)] = size[of[truth]]
-        block[of[rival], len(base) + 1 + np.arange(len(of[rival]))] = 1.0
+        block[:, len(base)] = size[truth]
+        block[list(of[rival]), len(base) + 1 + np.arange(len(of[rival]))] = 1.0
         blocks.append(block)
     targets = np.zeros((len(blocks) * len(found.values), 1, blocks[0].shape[1], 1))
     targets[:, 0, len(base)] = 1.0
-    what = f"least distance of {', '.join(effects)}"
+    what = f"least distance of {', '.join(of)}"
     return Criterion(APART, what, "σ", targets, inverse=True, blocks=np.stack(blocks))
 
 

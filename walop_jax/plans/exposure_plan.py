@@ -14,6 +14,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import rounded as digits
 from walop_jax.plans import criteria
 from walop_jax.plans.criteria import Criterion
+from walop_jax.plans.separating import DECIDED, Pair
 from walop_jax.simulation.observing_plan import ObservingPlan
 
 
@@ -60,10 +61,11 @@ class ExposurePlan(Displayed):
     reports them (% for errors of p). `needed` are the minutes in which the best plan reaches `goal`, and those in which
     none can. `before` and `after` (draw, point) are errors of p (fraction) at `x`, `y` (deg), NaN where one exposure
     holds no u. `beside` are other plans of the same time: their criterion, told likewise; `notes` what had to be left
-    out, and what these exposures cannot show. The bound holds for all angles of the polariser, and of the
-    calibration plate behind it if `any_plate`; `bound_of_go` is the least value of plans that contain the lines that
-    are `needed`. `lacks` is what a go needs and these exposures do not give, with the calibration to which they are
-    added, if they are (`added`): if nothing, a go is to be expected.
+    out, and what these exposures cannot show. The bound holds on a fine grid of angles of the polariser, and for the
+    angles of the calibration plate on its grid if `any_plate`; `bound_of_go` is the least value of plans that contain
+    the lines that are `needed`. `lacks` is what a go needs and these exposures do not give, with the calibration to
+    which they are added, if they are (`added`): if nothing, a go is to be expected. `pairs` are the members of a class
+    that the plan separates, each as the truth beside each other.
     """
 
     minutes: float
@@ -86,6 +88,7 @@ class ExposurePlan(Displayed):
     bound_of_go: float = float("nan")
     lacks: tuple[str, ...] = ()
     added: bool = False
+    pairs: tuple[Pair, ...] = ()
 
     @property
     def efficiency(self) -> float:
@@ -120,6 +123,7 @@ class ExposurePlan(Displayed):
             "minutes_to_goal": self.needed and dict(zip(("best", "least"), self.needed, strict=True)),
             "draws": len(self.after), "share_below_goal": self.share, "beside": dict(self.beside),
             "bound_of_go": self.bound_of_go, "efficiency": self.efficiency, "lacks": list(self.lacks),
+            "pairs": [pair._asdict() | {"separated": pair.after >= DECIDED} for pair in self.pairs],
             "notes": list(self.notes), "plan": self.observing_plan.document(),
         }  # fmt: skip
         if self.criterion.name == criteria.WORST:
@@ -165,6 +169,8 @@ class ExposurePlan(Displayed):
             takes = f"{best}, not counting changes; no plan needs less than {least}"
             facts[f"{digits(self.goal, '.3g')}{unit} takes"] = takes
         variance_of_plan = self.criterion.variance(self.value)
+        for pair in self.pairs:
+            facts[f"{pair.truth} or {pair.rival}"] = pair.in_words()
         for name, other_value in self.beside.items():
             factor = self.criterion.variance(other_value) / variance_of_plan
             variance = "equally good" if f"{factor:.2g}" == "1" else f"{factor:.2g} times the variance"

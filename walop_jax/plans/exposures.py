@@ -2,10 +2,9 @@
 
 Information  of an exposure e: J_eᵀ J_e, J_e the derivatives of its whitened residuals, fluxes eliminated, to the free
              parameters of the base model, from expected counts and the errors that they would have. No noise enters.
-Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ, and in 2α where the
-             calibration plate may stand at any angle α: they are computed at `NODES` angles and known at all. The
-             information, which divides by the variance of the counts, is a series of high degree in the direction
-             2α − θ behind the plate, of a lower one in α, cut at `ORDERS`; `Candidates.truncation` is the loss.
+Polariser    Light is linear, so that counts and their derivatives are series of low degree in 2θ: they are computed at
+             a few angles and known at all, those of the grid and, for the bound, of one six times finer.
+             `Candidates.truncation` is what the series leaves out.
 Draws        of the instrument as built, from the priors or around a calibration: the best plan depends on it.
 Limits       Detectors are linear. Exposures know of each other only by the parameters. Changes between exposures
              (slews, filters) cost time when the plan is put in order; the bound without them stays a bound.
@@ -14,7 +13,6 @@ Limits       Detectors are linear. Exposures know of each other only by the para
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
@@ -40,30 +38,25 @@ from walop_jax.model.effects.in_models import effect_context, known_effects, wit
 from walop_jax.model.ray import CONDITIONS
 from walop_jax.model.sources import MoonSky
 from walop_jax.model.specification import Model
-from walop_jax.plans.available import PLATE_TURN, Available, CandidateExposure, with_stops
-from walop_jax.plans.families import Family, Listed, even_angles, harmonics, highest, spread_angles
+from walop_jax.plans.available import Available, CandidateExposure, with_stops
+from walop_jax.plans.optimal import Family, Listed
 from walop_jax.simulation import simulate as simulation
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop
 
-NODES, NODES_OF_EFFECTS, NODES_OF_PLATE = 7, 13, 25
-"""Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, one more than it needs.
-Effects that are to be separated may depend on θ itself, which takes a whole turn. Beams that cross the plate at an
-angle make series of degree 12 in 2α."""
-ANGLES = 361
-"""Angles over half a turn at which the gain of an exposure is known, as a Fourier series in 2θ.
-
-So many since errors vary quickly where a camera is dark: over some √(σ²/N) rad, N its counts in full light."""
-ORDERS = (128, 64)
-"""Degrees of that series in 2(2α − θ) and in 2α where the calibration plate may stand at any angle α."""
+NODES, NODES_BEHIND_PLATES, NODES_OF_EFFECTS = 7, 3, 13
+"""Angles of the polariser at which counts are computed: a series of degree 3 in 2θ, two more than it needs; of degree 1
+for plates of the grid, of which there are many. Effects that are to be separated may depend on θ itself, which takes a
+whole turn."""
+FINER = 6
+"""Angles of the finer grid, on which the bound is computed in the end, in a step of the polariser."""
 GRID = 7
 """Field points along each axis at which the information is computed, each for some of the plan (`fewer_points`)."""
 DRAWS = 20
 NOT_CHOSEN = {condition: column for condition, column in CONDITIONS.items() if condition != "exptime"}
 """Conditions of an exposure that are as they come, and their columns."""
-_BETWEEN = 60  # places at which the series of a gain are held against the information itself
 Counts = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
 """Counts of light of unit flux, and their derivatives to the free parameters."""
-_AT_ONCE = (36, 1)  # field points, with one angle and with two: arrays stay small
+_AT_ONCE = 36  # field points: arrays stay small
 _ROUNDING = 1e-10  # of the largest eigenvalue
 
 
@@ -73,9 +66,9 @@ class Candidates:
 
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
     are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
-    of these. `truncation` is the largest error of the information between the angles that were computed, in units of
-    the mean diagonal of each parameter; `notes` say what had to be left out. `effects` are those that are to be
-    separated, parameters of the model as well, with whether their size is known.
+    of these. `truncation` is the highest harmonic of the counts in the angle of the polariser beside their mean: none
+    where the angles at which they were computed are enough. `notes` say what had to be left out. `effects` are those
+    that are to be separated, parameters of the model as well, with whether their size is known.
     """
 
     available: Available
@@ -89,17 +82,6 @@ class Candidates:
     notes: tuple[str, ...]
     effects: Mapping[str, bool] = dataclasses.field(default_factory=dict)
 
-    def with_plate(self, angles: Sequence[float]) -> Candidates:
-        """The same with the calibration plate at some angles (deg) where it may stand at any."""
-        pairs: list[tuple[CandidateExposure, Family]] = []
-        for choice, family in zip(self.choices, self.families, strict=True):
-            if isinstance(family, Polarised) and choice.free:
-                pairs += [(choice.with_plate(a), family.with_plate(a)) for a in angles]
-            else:
-                pairs.append((choice, family))
-        choices, families = tuple(choice for choice, _ in pairs), tuple(family for _, family in pairs)
-        return dataclasses.replace(self, choices=choices, families=families)
-
 
 def candidates(
     available: Available,
@@ -107,17 +89,16 @@ def candidates(
     draws: int = DRAWS,
     seed: int = 0,
     around: Calibration | None = None,
-    angles: int = ANGLES,
     effects: Sequence[str | Effect] = (),
     catalogue: Sequence[EffectKind] = EFFECTS,
     progress: Callable[[str], None] | None = None,
 ) -> Candidates:
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
-    Instruments are drawn from the priors, or from the posterior of the calibration `around`; `angles`, an odd number,
-    are those of the polariser. `effects` of the `catalogue` may be there as well, at their values; those given by
-    name alone at the size of their scale. Raises ValueError where nothing is left to be observed, and for effects
-    that do not act on light, or grow with time, hour angle or temperature.
+    Instruments are drawn from the priors, or from the posterior of the calibration `around`. `effects` of the
+    `catalogue` may be there as well, at their values; those given by name alone at the size of their scale. Raises
+    ValueError where nothing is left to be observed, and for effects that do not act on light, or grow with time, hour
+    angle or temperature.
     """
     tell = progress or (lambda text: None)
     choices, notes = available.choices()
@@ -125,15 +106,15 @@ def candidates(
         raise ValueError("; ".join(("nothing could be observed", *notes)))
     few, weight = fewer_points(available.plan)
     turn = 360.0 if effects else 180.0
-    choices = tuple(choice._replace(turn=turn) for choice in choices)
-    stops = [_nodes(choice, bool(effects)) for choice in choices]
+    choices = tuple(choice.over(turn) for choice in choices)
+    stops = [_nodes(choice, available, bool(effects)) for choice in choices]
     first = np.cumsum([0, *map(len, stops)])
     plan = with_stops(few, itertools.chain(*stops))
     tell("expected counts")
     calset = simulation.simulate(plan, seed=seed, noiseless=True, steady=True).calset
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
     kinds = (*catalogue, *(effect.kind for effect in effects if isinstance(effect, Effect)))
-    model, stated = _with(dataclasses.replace(model, catalogue=kinds), calset, effects)
+    model, stated = with_members(dataclasses.replace(model, catalogue=kinds), calset, effects)
     values = drawn(model, draws, seed, around)
     for i, p in enumerate(model.parameters):
         if p.part in stated:
@@ -164,14 +145,14 @@ def candidates(
         cost = choice.seconds + available.costs.of(choice.kind)
         if choice.kind == "clp":
             lit, counts = seen(choice, slice(start, stop))
-            families.append(Polarised(choice, lit, counts, _orders(choice, angles), cost))
+            families.append(Polarised.of(choice, lit, counts, cost))
             continue
         matrices = []
         for row in range(start, stop):
             lit, counts = seen(choice, slice(row, row + 1))
             matrices.append(np.stack([lit.information(*draw)[0] for draw in counts]))
         families.append(Listed.of(np.stack(matrices, axis=1), cost))
-    lost = max([0.0, *(f.lost() for f in families if isinstance(f, Polarised))])
+    lost = max([0.0, *(f.highest_harmonic() for f in families if isinstance(f, Polarised))])
     rows = prior_rows(model).jacobian(model.selection())
     names = tuple(model.names[i] for i in model.free)
     base = np.array([model.parameters[i].part not in stated for i in model.free])
@@ -179,7 +160,7 @@ def candidates(
     return Candidates(available, model, choices, tuple(families), values, names, prior, lost, notes, stated)
 
 
-def _with(
+def with_members(
     model: Model, calset: CalibrationSet, given: Sequence[str | Effect]
 ) -> tuple[Model, dict[str, bool]]:
     """The model with effects at their values, and which of them have one."""
@@ -250,28 +231,26 @@ def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Count
     return unit[:count], slopes[:count] @ select
 
 
-def _nodes(choice: CandidateExposure, effects: bool) -> tuple[Stop, ...]:
-    """The exposures at which counts are computed: evenly through the turn of the polariser, and of the plate."""
+def _nodes(choice: CandidateExposure, available: Available, effects: bool) -> tuple[Stop, ...]:
+    """The exposures at which counts are computed: evenly through the turn of the polariser."""
     if choice.kind != "clp":
         return choice.stops
-    count = NODES_OF_EFFECTS if effects else 3 if choice.free else NODES
-    polariser = (choice.turn / count * np.arange(count)).tolist()
-    plates = (PLATE_TURN / NODES_OF_PLATE * np.arange(NODES_OF_PLATE)).tolist()
-    at = itertools.product(plates if choice.free else [choice.stops[0].plate], polariser)
-    stop = functools.partial(dataclasses.replace, choice.stops[0])
-    return tuple(stop(polariser_angle=angle, plate=plate) for plate, angle in at)
+    listed = choice.stops[0].plate in available.plan.plate
+    count = NODES_OF_EFFECTS if effects else NODES if listed else NODES_BEHIND_PLATES
+    angles = (choice.turn / count * np.arange(count)).tolist()
+    return tuple(dataclasses.replace(choice.stops[0], polariser_angle=angle) for angle in angles)
 
 
-def _orders(choice: CandidateExposure, angles: int) -> tuple[int, ...]:
-    """Degrees of the series of a gain."""
-    turns = round(choice.turn / 180.0)
-    return (min(angles // 2, ORDERS[0]) * turns, ORDERS[1]) if choice.free else (angles // 2 * turns,)
+def _interpolating(phases: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarray, "s e"]:
+    """Weights of an odd number of equidistant nodes in the series through them, at phases (rad) of their turn."""
+    waves = np.arange(-(nodes // 2), nodes // 2 + 1)
+    apart = phases[:, None] - 2 * np.pi * np.arange(nodes) / nodes
+    return np.cos(apart[..., None] * waves).sum(axis=-1) / nodes
 
 
-def _interpolating(angle: Float[np.ndarray, " s"], nodes: int) -> Float[np.ndarray, "s e"]:
-    """Weights of equidistant nodes in the series through them."""
-    at_nodes = harmonics(even_angles((nodes // 2,))[:, 0], nodes // 2)
-    return harmonics(angle, nodes // 2) @ np.linalg.inv(at_nodes)
+def _even(count: int) -> Float[np.ndarray, " s"]:
+    """Phases (rad) evenly through a turn."""
+    return 2 * np.pi * np.arange(count) / count
 
 
 class Illumination(NamedTuple):
@@ -330,126 +309,76 @@ class Illumination(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Polarised(Family):
-    """Exposures through the polariser at any angle, and with the calibration plate at any, if it is free.
+    """Exposures through the polariser at the angles of the grid.
 
-    `counts` are those of unit flux and their derivatives at the nodes, for each draw; `orders` the degrees of the
-    series of a gain, `by` the parameters in which the information is asked for.
+    `counts` are those of unit flux and their derivatives at the nodes, for each draw, `angles` the number of candidates
+    in a turn; matrices that were asked for are `kept`.
     """
 
-    choice: CandidateExposure
     light: Illumination
     counts: tuple[Counts, ...]
-    orders: tuple[int, ...]
-    cost: float
-    by: Float[np.ndarray, "b f n"] | None = None
-    known: dict[bytes, Float[np.ndarray, "r n n"]] = dataclasses.field(default_factory=dict, compare=False)
+    angles: int
+    cost: Float[np.ndarray, " m"]
+    kept: dict[int, Float[np.ndarray, "r f f"]] = dataclasses.field(default_factory=dict, compare=False)
+
+    @classmethod
+    def of(
+        cls, choice: CandidateExposure, light: Illumination, counts: tuple[Counts, ...], cost: float
+    ) -> Polarised:
+        """The candidates of a choice."""
+        return cls(light, counts, len(choice.stops), np.full(len(choice.stops), float(cost)))
 
     @property
-    def _nodes(self) -> tuple[int, int]:
-        """Numbers of angles of plate and polariser at the nodes."""
-        plates, nodes = NODES_OF_PLATE if self.choice.free else 1, self.counts[0][0].shape[1]
-        return plates, nodes // plates
+    def _nodes(self) -> int:
+        return self.counts[0][0].shape[1]
 
-    def _weights(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "s e"]:
-        """Weights of the nodes in the counts at places."""
-        plates, angles = self._nodes
-        if plates == 1:
-            return _interpolating(places[:, 0], angles)
-        # The place is the direction behind the plate, 2α − θ.
-        polariser = 2 * PLATE_TURN / self.choice.turn * places[:, 1] - places[:, 0]
-        plate = _interpolating(places[:, 1], plates)
-        return (plate[:, :, None] * _interpolating(polariser, angles)[:, None]).reshape(len(places), -1)
-
-    def information(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, "r s n n"]:
-        """The matrices at these phases (`available.CandidateExposure`), kept for the next time."""
-        new = [place for place in places if place.tobytes() not in self.known]
+    def information(self, numbers: Sequence[int]) -> Float[np.ndarray, "r s f f"]:
+        """The matrices of these candidates."""
+        new = [number for number in dict.fromkeys(numbers) if number not in self.kept]
         if new:
-            weights = self._weights(np.stack(new))
-            matrices = []
-            for unit, slopes in self.counts:
-                of_draw = self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
-                matrices += [of_draw] if self.by is None else [t.T @ of_draw @ t for t in self.by]
-            self.known.update(zip((p.tobytes() for p in new), np.stack(matrices, axis=1), strict=True))
-        return np.stack([self.known[place.tobytes()] for place in places], axis=1)
+            matrices = self.at(2 * np.pi * np.array(new) / self.angles)
+            self.kept.update(zip(new, np.moveaxis(matrices, 1, 0), strict=True))
+        return np.stack([self.kept[number] for number in numbers], axis=1)
 
-    def turned(self, by: Float[np.ndarray, "b f n"]) -> Polarised:
-        """The same exposures."""
-        combined = by if self.by is None else np.concatenate([matrix @ by for matrix in self.by])
-        return dataclasses.replace(self, by=combined, known={})
+    def at(self, phases: Float[np.ndarray, " s"]) -> Float[np.ndarray, "r s f f"]:
+        """The matrices at any phases (rad) of the turn of the polariser."""
+        weights = _interpolating(phases, self._nodes)
+        each = (
+            self.light.information(_mixed(weights, unit), _mixed(weights, slopes))
+            for unit, slopes in self.counts
+        )
+        return np.stack(list(each))
 
-    def cost_at(self, places: Float[np.ndarray, "s d"]) -> Float[np.ndarray, " s"]:
-        """The cost, which is the same everywhere."""
-        return np.full(len(places), float(self.cost))
+    def gains(self, g: Float[np.ndarray, "r f f"]) -> Float[np.ndarray, " m"]:
+        """Σ_r tr G_r M_r of every candidate."""
+        return self._gains(g, self.angles)
 
-    def spread(self) -> Float[np.ndarray, "s d"]:
-        """Some angles."""
-        return spread_angles(self.orders)
+    def between(self, g: Float[np.ndarray, "r f f"]) -> float:
+        """The largest gain for its cost on the finer grid."""
+        return float(self._gains(g, FINER * self.angles).max() / self.cost[0])
 
-    def best(self, g: Float[np.ndarray, "r n n"], most: int) -> tuple[Float[np.ndarray, "s d"], float]:
-        """Local maxima of the gain, and the bound over all angles."""
-        places, largest = highest(self.gains(g), most)
-        return places, largest / self.cost
-
-    def gains(self, g: Float[np.ndarray, "r n n"]) -> Float[np.ndarray, ...]:
+    def _gains(self, g: Float[np.ndarray, "r f f"], count: int) -> Float[np.ndarray, " c"]:
         """Σ_r tr G_r M_r at even angles: products of derivatives are series of twice the degree of the counts."""
-        if self.by is not None:
-            blocks = g.reshape(len(self.counts), len(self.by), *g.shape[1:])
-            g = np.einsum("bfn,rbnm,bgm->rfg", self.by, blocks, self.by, optimize=True)
-        plates, angles = (count // 2 for count in self._nodes)
-        both = 2 * angles, 2 * (plates + round(2 * PLATE_TURN / self.choice.turn) * angles)
-        low = both[: len(self.orders)]
-        weights = self._weights(even_angles(low))
-        pairs = zip(self.orders, low, strict=True)
-        finer = [_interpolating(even_angles((o,))[:, 0], 2 * n + 1) for o, n in pairs]
-        total = np.zeros(np.prod([len(f) for f in finer]))
+        low = 2 * self._nodes - 1
+        weights, finer = _interpolating(_even(low), self._nodes), _interpolating(_even(count), low)
+        total = np.zeros(count)
         for (unit, slopes), matrix in zip(self.counts, g, strict=True):
             root = _root(matrix)
-            for i in range(0, len(unit), _AT_ONCE[len(finer) - 1]):
-                chunk = slice(i, i + _AT_ONCE[len(finer) - 1])
+            for i in range(0, len(unit), _AT_ONCE):
+                chunk = slice(i, i + _AT_ONCE)
                 along = np.tensordot(weights, slopes[chunk] @ root, (1, 1))
                 squares = (along @ along.swapaxes(2, 3))[:, :, *np.triu_indices(unit.shape[2])]
-                squares = squares.transpose(1, 2, 0)
                 u = np.tensordot(weights, unit[chunk], (1, 1)).transpose(1, 2, 0)
                 light = self.light._replace(flux=self.light.flux[chunk], weight=self.light.weight[chunk])
-                total += light.gain(_refined(u, finer), _refined(squares, finer))
-        return total.reshape([len(f) for f in finer])
+                total += light.gain(u @ finer.T, squares.transpose(1, 2, 0) @ finer.T)
+        return total
 
-    def with_plate(self, angle: float) -> Polarised:
-        """The same with the plate at an angle (deg)."""
-        _, angles = self._nodes
-        plate = 2 * np.pi * angle / PLATE_TURN
-        polariser = 2 * np.pi * np.arange(angles) / angles
-        behind = 2 * PLATE_TURN / self.choice.turn * plate - polariser
-        weights = self._weights(np.stack([behind, np.full(angles, plate)], axis=1))
-        counts = tuple((_mixed(weights, unit), _mixed(weights, slopes)) for unit, slopes in self.counts)
-        orders, choice = (ANGLES // 2 * round(self.choice.turn / 180.0),), self.choice.with_plate(angle)
-        return dataclasses.replace(self, choice=choice, counts=counts, orders=orders, known={})
-
-    def lost(self) -> float:
-        """Largest relative error of the gain of all parameters between its angles; or of the counts, if more."""
-        places = 2 * np.pi * np.random.default_rng(1).random((_BETWEEN, len(self.orders)))
-        first_draw = dataclasses.replace(self, counts=self.counts[:1], known={})
-        exact = first_draw.information(places)[0]
-        size = np.einsum("saa->a", exact) / len(exact)
-        weight = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
-        true = np.einsum("saa,a->s", exact, weight)
-        approximate = first_draw.gains(np.diag(weight)[None])[None]
-        for order, angle in zip(self.orders, places.T, strict=True):
-            at = _interpolating(angle, 2 * order + 1)
-            series = np.broadcast_to(approximate, (len(at), *approximate.shape[1:]))
-            approximate = np.einsum("si,si...->s...", at, series)
-        # The highest harmonic of the counts beside their mean: none where the series holds them.
+    def highest_harmonic(self) -> float:
+        """The highest harmonic of the counts at the nodes beside their mean; 0 where none is left to be higher."""
         unit = self.counts[0][0]
-        series = np.abs(np.fft.fft2(unit.reshape(len(unit), *self._nodes, unit.shape[2]), axes=(1, 2)))
-        high = [np.take(series, n // 2, i).max() for i, n in enumerate(self._nodes, 1) if n > 3]
-        return float(max(np.abs(approximate / true - 1.0).max(), *high / series[:, 0, 0].max()))
-
-
-def _refined(values: Float[np.ndarray, "*f s"], finer: Sequence[np.ndarray]) -> Float[np.ndarray, "*f u"]:
-    """Series at more angles."""
-    values = values.reshape(*values.shape[:-1], *(f.shape[1] for f in finer))
-    values = values @ finer[-1].T
-    return values if len(finer) == 1 else (finer[0] @ values).reshape(*values.shape[:-2], -1)
+        series = np.abs(np.fft.fft(unit, axis=1))
+        high = series[:, self._nodes // 2].max() if self._nodes > NODES_BEHIND_PLATES else 0.0
+        return float(high / series[:, 0].max())
 
 
 def _root(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n m"]:

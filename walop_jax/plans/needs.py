@@ -5,13 +5,14 @@ The error of p is least with a few angles of the polariser alone. A go asks for 
 shows what acts ahead of the polariser. What a calibration has already, to which the plan adds, counts.
 
 Directions   Those that the best plan uses most; where they are too few, the middles of the widest gaps between them.
-Sky          An unpolarised and a polarised standard, or patches around the Moon; what takes less time.
+Sky          An unpolarised and a polarised standard, or patches around the Moon; what takes less time, where those that
+             the best plan has anyway take none.
 Full turn    Light behind the polariser is the same half a turn later: every second direction is taken there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from walop_jax.data.inspection import FEW_ANGLES, about_exposures, sees_the_sky
 from walop_jax.data.records import Exposures
 from walop_jax.plans.available import CandidateExposure
 from walop_jax.plans.exposures import Candidates
+from walop_jax.plans.optimal import Weights
 
-Required = Mapping[tuple[int, tuple[float, ...]], float]
-"""Numbers of exposures by choice and place (`available.CandidateExposure`)."""
+Required = Weights
+"""Numbers of exposures by choice and number in it (`available.CandidateExposure`)."""
 
 _DIRECTION = 180.0  # deg after which light behind the polariser is the same
 _APART = 3.0  # deg: directions that are nearer are one
@@ -39,31 +41,36 @@ def required(found: Candidates, planned: Required, had: Sequence[Exposures]) -> 
     `planned` is the best plan without them. First what a go cannot do without (`calibration.certify.lacks`) and the
     directions, then the former alone.
     """
-    sky, directions = _of_the_sky(found, had), _directions(found, planned, had)
+    sky, directions = _of_the_sky(found, planned, had), _directions(found, planned, had)
     for wanted in ({**sky, **directions}, sky):
         if wanted:
             yield wanted
 
 
-def _of_the_sky(found: Candidates, had: Sequence[Exposures]) -> Required:
-    """One exposure each of an unpolarised and a polarised standard, or of patches around the Moon; nothing if seen."""
+def _of_the_sky(found: Candidates, planned: Required, had: Sequence[Exposures]) -> Required:
+    """One exposure each of an unpolarised and a polarised standard, or of patches around the Moon; nothing if seen.
+
+    Those that are planned anyway cost nothing.
+    """
     if sees_the_sky(*had):
         return {}
     plan, costs = found.available.plan, found.available.costs
     options: list[tuple[float, Required]] = []
     for number, choice in enumerate(found.choices):
-        cost = choice.seconds + costs.of(choice.kind)
+        # Those that are planned first.
+        order = sorted(range(len(choice.stops)), key=lambda i, number=number: (number, i) not in planned)
+        chosen = []
         if choice.kind == "moon":
-            patches = range(min(_PATCHES, len(choice.stops)))
-            options.append((cost * len(patches), {(number, (float(i),)): 1.0 for i in patches}))
+            chosen = order[:_PATCHES]
         if choice.kind == "standard":
-            stars = [stop.number for stop in choice.stops]
+            stars = [choice.stops[i].number for i in order]
             # A field of zero polarisation follows the standards.
-            unpolarised = [i for i, k in enumerate(stars) if k < plan.unpolarised or k >= plan.standards]
-            polarised = [i for i, k in enumerate(stars) if plan.unpolarised <= k < plan.standards]
-            if unpolarised and polarised:
-                pair = unpolarised[0], polarised[0]
-                options.append((cost * len(pair), {(number, (float(i),)): 1.0 for i in pair}))
+            unpolarised = [k < plan.unpolarised or k >= plan.standards for k in stars]
+            if len(set(unpolarised)) == 2:
+                chosen = [order[unpolarised.index(kind)] for kind in (True, False)]
+        if chosen:
+            each, wanted = choice.seconds + costs.of(choice.kind), {(number, i): 1.0 for i in chosen}
+            options.append((each * sum(key not in planned for key in wanted), wanted))
     return min(options, key=lambda option: option[0], default=(0.0, {}))[1]
 
 
@@ -73,24 +80,29 @@ def _directions(found: Candidates, planned: Required, had: Sequence[Exposures]) 
     if not indoors or found.available.plan.moving or any(e.further for e in had):
         return {}  # which element does the work of the polariser is not known here
     angles = [float(angle) for e in had for angle in e.clp_angle[e.clp_in]]
-    wanted: dict[tuple[int, tuple[float, ...]], float] = {}
-    for number, place in sorted(planned, key=lambda key: -planned[key]):
-        angle = indoors[number].stop(place).polariser_angle if number in indoors else None
+    wanted: dict[tuple[int, int], float] = {}
+    for key in sorted(planned, key=lambda key: -planned[key]):
+        angle = indoors[key[0]].stops[key[1]].polariser_angle if key[0] in indoors else None
         if angle is not None and len(_distinct(angles)) < FEW_ANGLES and _is_new(angle, angles):
             angles.append(angle)
-            wanted[number, place] = 1.0
+            wanted[key] = 1.0
     plain = indoors[number := min(indoors, key=lambda i: (*_plates(indoors[i]), indoors[i].seconds, i))]
+
+    def on_the_grid(angle: float) -> tuple[int, float]:
+        stop = plain.number(angle)
+        return stop, float(plain.stops[stop].polariser_angle or 0.0)
+
     while len(_distinct(angles)) < FEW_ANGLES:
         begin, gap = _widest(angles, _DIRECTION)
-        middle = round(float((begin + 0.5 * gap) % _DIRECTION), 3)
+        middle = (begin + 0.5 * gap) % _DIRECTION
         # Where half a turn later is another exposure the one that is farther from all others spreads them over a turn.
-        angles.append(
-            max((middle, middle + plain.turn - _DIRECTION), key=lambda angle: _farthest(angle, angles))
-        )
-        wanted[number, plain.place(angles[-1])] = 1.0
+        both = (on_the_grid(middle), on_the_grid(middle + plain.turn - _DIRECTION))
+        stop, angle = max(both, key=lambda found: _farthest(found[1], angles))
+        angles.append(angle)
+        wanted[number, stop] = 1.0
     begin, gap = _widest(angles, 360.0)
     if gap > _DIRECTION and plain.turn > _DIRECTION:
-        wanted[number, plain.place(round(float((begin + 0.5 * gap) % 360.0), 3))] = 1.0
+        wanted[number, on_the_grid(begin + 0.5 * gap)[0]] = 1.0
     return wanted
 
 
@@ -127,11 +139,11 @@ def _widest(angles: Sequence[float], turn: float) -> tuple[float, float]:
     return float(ordered[np.argmax(gaps)]), float(gaps.max())
 
 
-def half_a_turn_later(found: Candidates, planned: Required) -> set[tuple[int, tuple[float, ...]]]:
+def half_a_turn_later(found: Candidates, planned: Required) -> set[tuple[int, int]]:
     """Every second direction of the polariser: taken half a turn later the directions lie over a full turn."""
     angles = {}
-    for number, place in planned:
+    for number, stop in planned:
         choice = found.choices[number]
         if choice.kind == "clp" and choice.turn == _DIRECTION:
-            angles[number, place] = choice.stop(place).polariser_angle or 0.0
+            angles[number, stop] = choice.stops[stop].polariser_angle or 0.0
     return set(sorted(angles, key=lambda key: (angles[key], key))[1::2])

@@ -1,4 +1,4 @@
-"""Optimal experiments from information matrices, with a proof of how far a plan is from the best there is.
+"""Optimal experiments on a grid of candidates, with a bound on how far a plan is from the best there is.
 
 Nothing here depends on the kind of measurement. A candidate i has the Fisher information M_i (n × n) and the cost
 c_i; a plan gives it the weight w_i ≥ 0, how often it is done. With the prior information M₀ a plan leaves
@@ -10,24 +10,19 @@ criterion is the largest of them, averaged over draws r of the instrument,
 
     f(w) = mean_r max_k φ_rk(w),
 
-which holds A-, I- and c-optimality (one target), G-optimality (one target for each place) as cases. f is convex. Draws
-may share their largest variance in groups: the same experiment in other parameters, as for the separation of each pair
-of hypotheses (Atkinson & Fedorov 1975, Biometrika 62, 57). The mean is then one over groups, the maximum over all that
-a group holds.
+which holds A-, I- and c-optimality (one target), G-optimality (one target for each place) as cases. f is convex. The
+same experiment may be asked about in several sets of parameters T_b, of information T_bᵀ M T_b, as for the separation
+of each pair of hypotheses (Atkinson & Fedorov 1975, Biometrika 62, 57): the maximum is then over the targets of all.
 
-Proof        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ, G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
+Bound        For multipliers π_rk ≥ 0, Σ_k π_rk = 1, let L_r = Σ_k π_rk A_rk A_rkᵀ, G_r = M_r(w)⁻¹ L_r M_r(w)⁻¹. Every
              other plan v has, by Cauchy and Schwarz,
                  f(v) ≥ mean_r tr L_r M_r(v)⁻¹ ≥ (mean_r tr L_r M_r(w)⁻¹)² / mean_r tr G_r M_r(v),
-             and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir. The
-             maximum over all candidates, a continuum of them included, therefore bounds f from below: the equivalence
-             theorem of Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at any w.
-Candidates   come in families (`families`): a list, of a million if need be, or a continuum of angles.
-Solution     Column generation: a log-barrier Newton method solves the problem for a few candidates (min mean t_r with
-             φ_rk ≤ t_r; Boyd & Vandenberghe 2004, Convex Optimization, 11.3), those with the largest d_i / c_i join,
-             those without weight leave, until the proven gap is small.
-Rounding     Weights rounded down, the rest of the budget spent where it lowers f most for its cost, then exchanges of
-             single candidates while they lower f (Fedorov 1972, Theory of Optimal Experiments); the loss is proven by
-             the same lower bound.
+             and the denominator is at most mean_r tr G_r M₀r + B max_i d_i / c_i, d_i = mean_r tr G_r M_ir: the
+             equivalence theorem of Kiefer & Wolfowitz (1960, Canad. J. Math. 12, 363) as an inequality that holds at
+             any w. The maximum is that over the grid, and in the end once that over a finer one.
+Weights      Exchange: candidates with the largest d_i / c_i join, those without weight leave, until the bound is near.
+             The maximum over targets is a power mean of growing power, whose minimum L-BFGS-B finds.
+Whole        Numbers: `rounding`.
 
 Units        Those of the caller: information per unit of weight, cost in those of the budget.
 Limits       Local design: the information is that at assumed parameters, or its average over draws of them.
@@ -35,76 +30,146 @@ Limits       Local design: the information is that at assumed parameters, or its
 
 from __future__ import annotations
 
+import abc
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import linalg
-
-from walop_jax.likelihood.inverses import root_of
-from walop_jax.plans.families import Family
+from scipy.optimize import minimize
 
 Weight = Float[np.ndarray, " s"]
 OfTargets = Float[np.ndarray, "r k"]
 Matrices = Float[np.ndarray, "r n n"]
-Levels = Float[np.ndarray, " g"]
-Vector = Float[np.ndarray, " v"]
+Key = tuple[int, int]
+"""Number of the family of a candidate, and its own there."""
+Weights = Mapping[Key, float]
 
-GAP = 0.01  # proven distance from the optimum at which the search ends
-_ROUNDS = 60  # of column generation
-_NEWTON = 80  # steps for one set of candidates
-_SHARPER = 8.0  # factor by which the barrier falls between two Newton solutions
+GAP = 0.01  # distance from the bound at which the search ends
+_ROUNDS = 40  # of candidates that join and leave
+_POWERS = (8.0, 40.0, 200.0, 1000.0, 5000.0)  # of the mean that stands for the maximum over targets
+_QUICKLY = 2  # of these powers that have a round each, whatever it brings
+_BETTER, _PATIENCE = (
+    0.02,
+    6,
+)  # of the gap: what brings less is idle; rounds in a row after which the search ends
+_STEPS = 300  # of L-BFGS-B in a round
+_SPREAD, _OF_EACH = 96, 3  # candidates that a search begins with: of all families, of each at least
+_TOPS, _OF_FAMILY = 24, 3  # candidates that may join in a round: of all families, of each
 _LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
-_MAIN = 1e-5  # of the largest eigenvalue: curvature below it is left out of a step
-_ROUGH, _EXACT = 0.1, 1e-4  # of μ: Newton's decrement at which a centre is left, and at which it is found
-_BENT = 5  # draws whose curvature stands for that of all
-_NEAR = 0.85  # of the largest variance: targets below it wait until they are among the largest
-_ROUNDING = 1e-15  # of a matrix of unit diagonal, for each of its rows
 _NOTHING = 1e-9  # of the information of everything
-_HOPELESS = 1e3  # times the criterion of the best weights: some target is not determined
-_EXCHANGES = 200
-_TRIED = 60  # exchanges, most promising first, of which the first that lowers the criterion is made
-_SHARPNESS = 20  # power of the variances by which targets share the slope of an exchange
+_NEAR = 0.8  # of the largest variance: targets below it wait until they are among the largest
 _BUDGETS = 8  # tried until a criterion is met
+_HIGH = 0.8  # of the largest gain: families that reach it nowhere on the grid do not exceed it between
 _ENDLESS = 1e6  # times the budget: no plan reaches the criterion
 _SMALL = 1e-3  # of the budget: the prior reaches the criterion already
-_ONE_PLACE = 4e-3  # between coordinates that are one: 0.1° of half a turn, and less than a step in a list
-_TOPS = 8  # candidates of each family that may join in a round
-_PATIENCE = 4  # rounds without a better bound or value after which the search ends
 
 
 class NotEstimableError(ValueError):
     """A target depends on parameters that neither the candidates nor the prior inform about."""
 
 
+class Family(abc.ABC):
+    """Candidates that have something in common, each with its number, an information matrix in every draw, a cost."""
+
+    cost: Float[np.ndarray, " m"]
+
+    @abc.abstractmethod
+    def information(self, numbers: Sequence[int]) -> Float[np.ndarray, "r s n n"]:
+        """The matrices of some candidates."""
+
+    @abc.abstractmethod
+    def gains(self, g: Matrices) -> Float[np.ndarray, " m"]:
+        """Σ_r tr G_r M_r of every candidate."""
+
+    def between(self, g: Matrices) -> float:
+        """The largest gain for its cost of those that lie between the candidates, where there are such."""
+        return 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Listed(Family):
+    """Candidates one by one, by their matrices (draw, candidate, parameter, parameter)."""
+
+    matrices: Float[np.ndarray, "r m n n"]
+    cost: Float[np.ndarray, " m"]
+
+    @classmethod
+    def of(
+        cls, matrices: Float[np.ndarray, "r m n n"], cost: float | Float[np.ndarray, " m"] = 1.0
+    ) -> Listed:
+        """Candidates of one cost, or each of its own."""
+        return cls(matrices, np.array(np.broadcast_to(cost, matrices.shape[1]), float))
+
+    def information(self, numbers: Sequence[int]) -> Float[np.ndarray, "r s n n"]:
+        """Matrices of the candidates with these numbers."""
+        return self.matrices[:, list(numbers)]
+
+    def gains(self, g: Matrices) -> Float[np.ndarray, " m"]:
+        """Σ_r tr G_r M_r of every candidate."""
+        r, m = self.matrices.shape[:2]
+        return np.einsum("rma,ra->m", self.matrices.reshape(r, m, -1), g.reshape(r, -1), optimize=True)
+
+
 @dataclasses.dataclass(frozen=True)
 class Experiment:
     """Problem to be solved: targets, prior information and candidates.
 
-    `known` is M₀ (draw, n, n), `targets` A (draw, target, n, q), `families` the candidates, `budget` the cost that a
-    plan may have; `together` draws in a row share their largest variance. Raises NotEstimableError, when solved, if a
-    target depends on a direction nothing informs about.
+    `families` are the candidates, of draws of n parameters; `blocks` T (block, n, own) lead from the parameters in
+    which targets are asked for (None: the same). `known` is M₀ (draw and block, own, own), the blocks of a draw one
+    after the other, `targets` A (draw and block, target, own, q); `budget` is the cost that a plan may have.
     """
 
     known: Matrices
     targets: Float[np.ndarray, "r k n q"]
     families: tuple[Family, ...]
     budget: float
-    together: int = 1
+    blocks: Float[np.ndarray, "b f n"] | None = None
 
-    def largest(self, phi: OfTargets) -> Levels:
-        """The largest variance of each group of draws."""
+    @property
+    def together(self) -> int:
+        """Number of blocks, which share their largest variance."""
+        return 1 if self.blocks is None else len(self.blocks)
+
+    def cost(self, weights: Weights) -> float:
+        """Σ c w."""
+        return sum(weight * float(self.families[f].cost[i]) for (f, i), weight in weights.items())
+
+    def information(self, keys: Sequence[Key]) -> Float[np.ndarray, "r s n n"]:
+        """Matrices of candidates, in the parameters of the targets."""
+        matrices = np.concatenate([self.families[f].information([i]) for f, i in keys], axis=1)
+        if self.blocks is None:
+            return matrices
+        turned = self.blocks.swapaxes(1, 2)[:, None] @ matrices[:, None] @ self.blocks[:, None]
+        return turned.reshape(-1, *turned.shape[2:])
+
+    def total(self, weights: Weights) -> Matrices:
+        """Σ w M without the prior."""
+        keys = list(weights)
+        if not keys:
+            return np.zeros_like(self.known)
+        return np.einsum("s,rsab->rab", np.array([weights[key] for key in keys]), self.information(keys))
+
+    def of_families(self, g: Matrices) -> Float[np.ndarray, "d f f"]:
+        """G in the parameters of the families, so that Σ tr G M is the same."""
+        if self.blocks is None:
+            return g
+        each = g.reshape(-1, self.together, *g.shape[1:])
+        return np.asarray(np.einsum("bfn,rbnm,bgm->rfg", self.blocks, each, self.blocks, optimize=True))
+
+    def largest(self, phi: OfTargets) -> Float[np.ndarray, " g"]:
+        """The largest variance of each draw."""
         return np.asarray(phi.reshape(len(phi) // self.together, -1).max(axis=1))
 
     def relative(self, phi: OfTargets) -> OfTargets:
-        """Variances over the largest of their group."""
+        """Variances over the largest of their draw."""
         return phi / np.repeat(self.largest(phi), self.together)[:, None]
 
     def of_one(self, shares: OfTargets) -> OfTargets:
-        """Multipliers with sum 1 in each group."""
+        """Multipliers with sum 1 in each draw."""
         total = shares.reshape(len(shares) // self.together, -1).sum(axis=1)
         return shares / np.repeat(total, self.together)[:, None]
 
@@ -113,12 +178,8 @@ class Experiment:
 
         Directions that nothing informs about (gauges) are left out. Raises NotEstimableError if a target needs one.
         """
-        each = self.budget / len(self.families)
-        shares = [each / family.cost_at(family.spread()) for family in self.families]
-        total = self.known.mean(axis=0) + sum(
-            np.tensordot(w / len(w), f.information(f.spread()).mean(axis=0), (0, 0))
-            for w, f in zip(shares, self.families, strict=True)
-        )
+        start = spread(self)
+        total = (self.known + self.total(start)).mean(axis=0)
         size = np.sqrt(np.clip(np.diag(total), 0.0, None))
         size = np.where(size > 0, size, 1.0)
         value, vector = linalg.eigh(total / np.outer(size, size))
@@ -132,27 +193,39 @@ class Experiment:
         if len(bad):
             listed = ", ".join(map(str, bad[:5].tolist()))
             raise NotEstimableError(f"targets {listed} depend on parameters that no candidate informs about")
-        families = tuple(family.turned(to_seen[None]) for family in self.families)
         # Directions that a few candidates leave open get next to no information: no target needs them, or it is bad.
         prior = to_seen.T @ self.known @ to_seen + _NOTHING * np.eye(int(informed.sum()))
-        return Experiment(prior, visible, families, self.budget, self.together)
+        blocks = np.eye(len(to_seen))[None] if self.blocks is None else self.blocks
+        return Experiment(prior, visible, self.families, self.budget, blocks @ to_seen)
+
+
+def spread(experiment: Experiment) -> dict[Key, float]:
+    """A few candidates, evenly through each family, that cost the budget: with them a search begins."""
+    count = max(_SPREAD // len(experiment.families), _OF_EACH)
+    keys = [
+        (f, int(i))
+        for f, family in enumerate(experiment.families)
+        for i in np.unique(np.linspace(0, len(family.cost), count, endpoint=False).astype(int))
+    ]
+    each = experiment.budget / len(keys)
+    return {(f, i): each / float(experiment.families[f].cost[i]) for f, i in keys}
 
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """Bound on all plans: f ≥ here² / (known + budget · ratio), in the symbols of the module.
-
-    `tops` are the candidates that promise most, as number of the family and place.
-    """
+    """Bound on all plans: f ≥ here² / (known + budget · ratio), in the symbols of the module."""
 
     here: float
     known: float
     ratio: float
-    tops: tuple[tuple[int, Float[np.ndarray, " _"]], ...]
 
     def value(self, budget: float) -> float:
         """The least criterion of any plan of a budget."""
         return self.here**2 / (self.known + budget * self.ratio)
+
+    def mean(self, budget: float) -> float:
+        """The gain for its cost of the candidates of the plan from which the bound comes, on average."""
+        return (self.here - self.known) / budget
 
     def budget(self, value: float) -> float:
         """The least budget of any plan that reaches a criterion."""
@@ -161,221 +234,138 @@ class Bound:
 
 @dataclasses.dataclass(frozen=True)
 class Allocation:
-    """Number of times for each candidate, the criterion, and the least that any plan of this budget can have.
+    """Number of times for each candidate in it, the criterion, and the least that any plan of this budget can have.
 
-    `family` (number of the family), `place` (its coordinates there) and `weight` are one for each candidate in it.
     `bound` ≤ the criterion of every plan; `proof` says so for other budgets as well.
     """
 
-    family: Int[np.ndarray, " s"]
-    place: list[Float[np.ndarray, " _"]]
-    weight: Weight
+    weights: Weights
     value: float
     bound: float
     proof: Bound
 
     @property
     def gap(self) -> float:
-        """Proven relative distance of the criterion from that of the best plan."""
+        """Relative distance of the criterion from its bound, and so at most from that of the best plan."""
         return self.value / self.bound - 1.0
 
-    @property
-    def weights(self) -> dict[tuple[int, tuple[float, ...]], float]:
-        """The weights by family and place."""
-        keys = ((int(f), tuple(p.tolist())) for f, p in zip(self.family, self.place, strict=True))
-        return dict(zip(keys, self.weight.tolist(), strict=True))
 
+class Some:
+    """The problem for a few candidates: their matrices laid out, variances and slopes of them."""
 
-class _Some:
-    """The problem for a few candidates: their matrices laid out, and the barrier method on them."""
+    def __init__(self, experiment: Experiment, keys: Iterable[Key]) -> None:
+        self.experiment, self.keys = experiment, list(keys)
+        self.matrices = experiment.information(self.keys)
+        self.costs = np.array([float(experiment.families[f].cost[i]) for f, i in self.keys])
+        r, _, n, q = experiment.targets.shape
+        self.wide = np.moveaxis(experiment.targets, 2, 1).reshape(r, n, -1)
+        self.columns = q
 
-    def __init__(self, experiment: Experiment, chosen: Sequence[tuple[int, Float[np.ndarray, " _"]]]) -> None:
-        self.experiment, self.chosen = experiment, list(chosen)
-        places = [(experiment.families[number], np.atleast_2d(place)) for number, place in self.chosen]
-        self.matrices = np.stack([f.information(at)[:, 0] for f, at in places], axis=1)  # (r, s, n, n)
-        self.costs = np.array([float(family.cost_at(at)[0]) for family, at in places])
-        _, k, _, q = experiment.targets.shape
-        self.wide = _side_by_side(experiment.targets)
-        self.per_target = (k, q)
+    def with_more(self, keys: Iterable[Key]) -> Some:
+        """The same with further candidates at the end."""
+        more = [key for key in keys if key not in self.keys]
+        if not more:
+            return self
+        both = copy.copy(self)
+        both.keys, costs = self.keys + more, [float(self.experiment.families[f].cost[i]) for f, i in more]
+        both.matrices = np.concatenate([self.matrices, self.experiment.information(more)], axis=1)
+        both.costs = np.append(self.costs, costs)
+        return both
 
-    def information(self, weight: Weight) -> Matrices:
-        """M(w) of every draw."""
-        r, s, n, _ = self.matrices.shape
-        information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
-        return 0.5 * (information + np.swapaxes(information, 1, 2))
+    def only(self, which: Sequence[int]) -> Some:
+        """The same with some of the candidates."""
+        some = copy.copy(self)
+        some.keys, some.matrices = [self.keys[i] for i in which], self.matrices[:, list(which)]
+        some.costs = self.costs[list(which)]
+        return some
 
     def covariance(self, weight: Weight) -> Matrices:
         """M(w)⁻¹ of every draw."""
-        return np.linalg.inv(self.information(weight))
+        r, s, n, _ = self.matrices.shape
+        information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
+        return np.linalg.inv(0.5 * (information + np.swapaxes(information, 1, 2)))
 
     def variances(self, weight: Weight) -> OfTargets:
         """φ of every target."""
         return self._by_target(self.wide * (self.covariance(weight) @ self.wide))
 
-    def _by_target(self, products: Float[np.ndarray, "*l n kq"]) -> Float[np.ndarray, "*l k"]:
-        """Sums over the parameters and the columns of each target."""
-        summed = products.sum(axis=-2)
-        return summed.reshape(*summed.shape[:-1], *self.per_target).sum(axis=-1)
-
-    def gains(self, y: Float[np.ndarray, "r n kq"]) -> Float[np.ndarray, "r s k"]:
-        """−∂φ/∂w: tr y_kᵀ M_s y_k of every target and candidate, y = M⁻¹ A."""
-        (k, q), (r, s, n, _) = self.per_target, self.matrices.shape
-        gains = np.empty((r, s, k))
-        for columns, matrices, into in zip(y, self.matrices, gains, strict=True):
-            by_target = columns.reshape(n, k, q).transpose(1, 0, 2)
-            into[:] = matrices.reshape(s, -1) @ (by_target @ by_target.swapaxes(1, 2)).reshape(k, -1).T
-        return gains
-
-    def plan(self, weight: Weight, least: float, bound: float, proof: Bound) -> Allocation:
-        """The candidates that cost more than `least` with their weights."""
-        used = np.flatnonzero(weight * self.costs > least)
-        family, place = np.array([self.chosen[i][0] for i in used]), [self.chosen[i][1] for i in used]
-        return Allocation(family, place, weight[used], self.value(weight), bound, proof)
+    def _by_target(self, products: Float[np.ndarray, "r n kq"]) -> OfTargets:
+        return products.sum(axis=1).reshape(len(products), -1, self.columns).sum(axis=-1)
 
     def value(self, weight: Weight) -> float:
-        """The criterion f(w)."""
-        return float(self.experiment.largest(self.variances(weight)).mean())
-
-    def solve(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
-        """Weights within `gap` of the best, and the multipliers π of the targets.
-
-        Barrier: mean_g t_g − μ [Σ log(t_g − φ_rk) + Σ log w_s], g the group of r, Newton in (w, t) on the budget's
-        plane.
-        """
-        weight = np.maximum(weight, 1e-3 * self.experiment.budget / self.costs.sum())
-        weight *= self.experiment.budget / (self.costs @ weight)
-        phi = self.variances(weight)
-        peak = np.zeros(phi.shape)
-        while True:
-            peak = np.maximum(peak, self.experiment.relative(phi))
-            near = _nearest(peak)
-            weight, shares = self._of_targets(near)._solved(weight, gap)
-            phi = self.variances(weight)
-            top = self.experiment.largest(np.take_along_axis(phi, near, axis=1))
-            if np.all(self.experiment.largest(phi) <= (1.0 + 0.1 * gap) * top):
-                multipliers = np.zeros(phi.shape)
-                np.put_along_axis(multipliers, near, shares, axis=1)
-                return weight, multipliers
-
-    def worst(self, phi: OfTargets) -> _Some:
-        """The same for the targets with the largest variances: whose value bounds that of all from below."""
-        return self._of_targets(_nearest(self.experiment.relative(phi)))
-
-    def _of_targets(self, near: Int[np.ndarray, "r l"]) -> _Some:
-        """The same for some of the targets of each draw."""
-        subset = copy.copy(self)
-        r, _, n, q = self.experiment.targets.shape
-        columns = np.take_along_axis(self.wide.reshape(r, n, -1, q), near[:, None, :, None], axis=2)
-        subset.wide = columns.reshape(r, n, -1)
-        subset.per_target = (near.shape[1], q)
-        return subset
-
-    def _solved(self, weight: Weight, gap: float) -> tuple[Weight, OfTargets]:
-        phi = self.variances(weight)
-        constraints = phi.size + len(weight)
-        level = self.experiment.largest(phi)
-        mu = level.mean() / constraints
-        level = level + len(level) * mu
-        least = 0.2 * gap * level.mean() / constraints
-        while mu > 1.1 * least:
-            weight, level = self._centred(weight, level, mu, _ROUGH)
-            mu = max(mu / _SHARPER, least)
-        weight, level = self._centred(weight, level, mu, _EXACT)
-        slack = self._slack(level, self.variances(weight))
-        return weight, self.experiment.of_one(1.0 / np.maximum(slack, 1e-300))
-
-    def _slack(self, level: Levels, phi: OfTargets) -> OfTargets:
-        return np.repeat(level, self.experiment.together)[:, None] - phi
-
-    def _barrier(self, weight: Weight, level: Levels, mu: float) -> float:
-        if np.any(weight <= 0):
-            return np.inf
+        """The criterion f(w); infinite where a target is not determined."""
         try:
-            slack = self._slack(level, self.variances(weight))
+            return float(self.experiment.largest(self.variances(weight)).mean())
         except np.linalg.LinAlgError:
             return np.inf
-        if np.any(slack <= 0):
-            return np.inf
-        return float(level.mean() - mu * (np.log(slack).sum() + np.log(weight).sum()))
 
-    def _centred(self, weight: Weight, level: Levels, mu: float, enough: float) -> tuple[Weight, Levels]:
-        """Newton's method for one μ, until its decrement is `enough` of μ."""
-        s, r = len(weight), len(level)
-        sample = slice(None, None, -(-len(self.wide) // _BENT))
+    def near(self, *weights: Weight) -> Some:
+        """The same for the targets with the largest variances in some plans: whose value is at most that of all."""
+        relative = np.maximum.reduce([self.experiment.relative(self.variances(weight)) for weight in weights])
+        kept = np.argsort(-relative, axis=1)[:, : int((relative >= _NEAR).sum(axis=1).max())]
+        some, (r, n, _) = copy.copy(self), self.wide.shape
+        columns = np.take_along_axis(
+            self.wide.reshape(r, n, -1, self.columns), kept[:, None, :, None], axis=2
+        )
+        some.wide = columns.reshape(r, n, -1)
+        return some
 
-        def grouped(values: Float[np.ndarray, "*d"]) -> Float[np.ndarray, "*g"]:
-            return values.reshape(r, -1, *values.shape[1:]).sum(axis=1)
+    def power_mean(self, weight: Weight, power: float) -> tuple[float, Weight]:
+        """mean_r (Σ_k φ_rk^p)^(1/p) and its slope."""
+        covariance = self.covariance(weight)
+        y = covariance @ self.wide
+        phi = self._by_target(self.wide * y)
+        top = self.experiment.largest(phi)
+        raised = self.experiment.relative(phi) ** power
+        total = raised.reshape(len(top), -1).sum(axis=1)
+        # d‖φ‖_p / dφ_k = (φ_k / ‖φ‖_p)^(p − 1)
+        each = np.repeat(top * total ** (1.0 / power), self.experiment.together)[:, None]
+        push = (phi / each) ** (power - 1.0) / len(top)
+        g = (y * np.repeat(push, self.columns, axis=1)[:, None]) @ y.swapaxes(1, 2)
+        r, s = self.matrices.shape[:2]
+        slope = -np.einsum("rsa,ra->s", self.matrices.reshape(r, s, -1), g.reshape(r, -1), optimize=True)
+        return float((top * total ** (1.0 / power)).mean()), slope
 
-        for _ in range(_NEWTON):
-            covariance = self.covariance(weight)
-            y = covariance @ self.wide
-            slope = -self.gains(y)
-            slack = self._slack(level, self._by_target(self.wide * y))
-            push = mu / slack
-            # Curvature of the φ: Σ_k push_k 2 tr(M_s P M_t Q), P = M⁻¹, Q = Σ_k push_k y_k y_kᵀ. Its main part in some
-            # of the draws, which are much alike, is enough to step by.
-            pushed = y[sample] * np.repeat(push[sample], self.per_target[1], axis=1)[:, None]
-            inverse_root = np.linalg.inv(np.linalg.cholesky(self.information(weight)[sample]))
-            right = root_of(pushed @ np.swapaxes(y[sample], 1, 2), _MAIN)
-            products = inverse_root[:, None] @ (self.matrices[sample] @ right[:, None])
-            flat = np.moveaxis(products, 1, 0).reshape(s, -1)
-            alike = push.sum() / push[sample].sum()
-            hessian = np.zeros((s + r, s + r))
-            gradient = np.zeros(s + r)
-            gradient[:s] = np.einsum("rk,rsk->s", push, slope) - mu / weight
-            gradient[s:] = 1.0 / r - grouped(push.sum(axis=1))
-            hessian[:s, :s] = 2.0 * alike * flat @ flat.T + np.diag(mu / weight**2)
-            stiff = mu / slack**2
-            hessian[:s, :s] += np.einsum("rsk,rtk->st", slope * stiff[:, None], slope, optimize=True)
-            hessian[:s, s:] = -grouped(np.einsum("rk,rsk->rs", stiff, slope)).T
-            hessian[s:, :s] = hessian[:s, s:].T
-            hessian[s:, s:] += np.diag(grouped(stiff.sum(axis=1)))
-            step = _on_the_budget(hessian, gradient, np.append(self.costs, np.zeros(r)))
-            decrement = float(-gradient @ step)
-            current, length = self._barrier(weight, level, mu), 1.0
-            while length > 1e-10:
-                new = weight + length * step[:s], level + length * step[s:]
-                trial = self._barrier(*new, mu)
-                if trial <= current - 0.1 * length * decrement:
-                    break
-                length *= 0.5
-            else:
-                break
-            weight, level = new
-            if decrement < enough * mu:
-                break
-        return weight, level
+    def solved(self, share: Weight, power: float, gap: float) -> Weight:
+        """Shares of the budget with the least power mean; those given are where the search begins."""
+        each, begin = self.experiment.budget / self.costs, [share]
+        if power <= _POWERS[0]:
+            return self._solved(share, power, gap)
+        while True:
+            # Targets that are not among the largest wait until they are.
+            near = self.near(*(each * one for one in begin))
+            share = near._solved(begin[-1], power, gap)
+            if self.value(each * share) <= near.value(each * share) * (1 + 0.1 * gap):
+                return share
+            begin.append(share)
 
+    def _solved(self, share: Weight, power: float, gap: float) -> Weight:
+        each = self.experiment.budget / self.costs
 
-def _side_by_side(targets: Float[np.ndarray, "r k n q"]) -> Float[np.ndarray, "r n kq"]:
-    """A of all targets in one matrix."""
-    r, _, n, _ = targets.shape
-    return np.moveaxis(targets, 2, 1).reshape(r, n, -1)
+        def function(free: Weight) -> tuple[float, Weight]:
+            total = free.sum()
+            value, slope = self.power_mean(each * free / total, power)
+            along = each * slope
+            # Shares count by their proportions alone: their sum is held near 1.
+            return np.log(value) + 0.5 * (total - 1.0) ** 2, (
+                (along - along @ free / total) / total / value + total - 1.0
+            )
 
-
-def _nearest(relative: OfTargets) -> Int[np.ndarray, "r l"]:
-    """Numbers of the targets that come near the largest, as many in each draw."""
-    count = int((relative >= _NEAR).sum(axis=1).max())
-    return np.argsort(-relative, axis=1)[:, :count]
-
-
-def _on_the_budget(hessian: Float[np.ndarray, "v v"], gradient: Vector, cost: Vector) -> Vector:
-    """The Newton step that leaves cost · step = 0."""
-    size = np.sqrt(np.diag(hessian))
-    factor = linalg.cho_factor(hessian / np.outer(size, size) + _ROUNDING * len(size) * np.eye(len(size)))
-    free = linalg.cho_solve(factor, gradient / size) / size
-    along = linalg.cho_solve(factor, cost / size) / size
-    return -(free - along * (cost @ free) / (cost @ along))
+        options = {"maxiter": _STEPS, "maxcor": 30, "ftol": 1e-3 * gap / _STEPS, "gtol": 0.02 * gap}
+        found = minimize(
+            function, share, jac=True, method="L-BFGS-B", bounds=[(1e-9, None)] * len(share), options=options
+        )
+        return found.x / found.x.sum()
 
 
 def optimise(
     experiment: Experiment, *, gap: float = GAP, progress: Callable[[str], None] | None = None
 ) -> Allocation:
-    """The plan with the least criterion, to a proven relative `gap`, and the proof.
+    """The plan with the least criterion, to a relative `gap` from its bound, and the bound.
 
     `progress` gets value, bound and gap of every round.
     Raises NotEstimableError for a target that nothing informs about, ValueError for a budget that is not positive. The
-    gap that was reached is `Allocation.gap`: larger than asked for only if rounding errors end the search.
+    gap that was reached is `Allocation.gap`.
     """
     if not experiment.budget > 0:
         raise ValueError(f"the budget is {experiment.budget:g}: nothing can be done with it")
@@ -384,65 +374,93 @@ def optimise(
 
 def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | None = None) -> Allocation:
     """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
-    chosen = [(number, place) for number, f in enumerate(problem.families) for place in f.spread()]
-    active_problem = _Some(problem, chosen)
-    weight = np.full(len(chosen), problem.budget / active_problem.costs.sum())
-    best_bound, best, plan, idle, accuracy = 0.0, None, None, 0, 0.2
+    some = Some(problem, spread(problem))
+    share, level = np.full(len(some.keys), 1.0 / len(some.keys)), 0
+    proof, value, weight, at, idle = None, np.inf, share, some, 0
     for turn in range(1, _ROUNDS + 1):
-        weight, shares = active_problem.solve(weight, accuracy)
-        value = active_problem.value(weight)
-        proof = lower_bound(problem, active_problem.covariance(weight), shares)
-        bound = proof.value(problem.budget)
-        best = proof if best is None or bound > best_bound else best
-        least = 1e-2 * gap
-        better = plan is None or bound > best_bound * (1 + least) or value < plan.value * (1 - least)
+        power, each = _POWERS[level], problem.budget / some.costs
+        share = some.solved(share, power, gap)
+        here, covariance = some.value(each * share), some.covariance(each * share)
+        shares = multipliers(some, each * share, power)
+        bound, gains = bounded(problem, covariance, shares)
+        new, known = bound.value(problem.budget), 0.0 if proof is None else proof[0].value(problem.budget)
+        better = here < value * (1 - _BETTER * gap) or new > known * (1 + _BETTER * gap)
         idle = 0 if better else idle + 1
-        best_bound = max(best_bound, bound)
-        least = _LEAST_WEIGHT * problem.budget
-        plan = active_problem.plan(weight, least, best_bound, best)
+        if here < value:
+            value, weight, at = here, each * share, some
+        if proof is None or new > known:
+            proof = bound, covariance, shares
+        least = proof[0].value(problem.budget)
         if progress is not None:
-            numbers = f"criterion {value:.6g}, bound {best_bound:.6g}, gap {100 * plan.gap:.2g} %"
-            progress(f"round {turn}: {numbers}")
-        exact = accuracy <= 0.5 * gap
-        if plan.gap <= gap or (exact and idle >= _PATIENCE):
+            progress(
+                f"round {turn}: criterion {value:g}, bound {least:g}, gap {100 * (value / least - 1):.2g} %"
+            )
+        if value <= least * (1 + gap) or idle >= _PATIENCE:
             break
-        used = weight * active_problem.costs > least
-        active = [c for c, keep in zip(active_problem.chosen, used, strict=True) if keep]
-        new = [top for top in proof.tops if not any(_same(top, candidate) for candidate in active)]
-        if exact and not new and turn > 3:
-            break
-        # Far from the end candidates matter, not their exact weights.
-        accuracy = 0.5 * gap if idle or not new else max(0.5 * gap, min(accuracy, 0.3 * plan.gap))
-        share = 0.05 * problem.budget / max(len(new), 1)
-        active_problem = _Some(problem, [*active, *new])
-        weight = np.concatenate([0.95 * weight[used], share / active_problem.costs[len(active) :]])
-    assert plan is not None
-    return plan
+        kept = np.flatnonzero(share > _LEAST_WEIGHT)
+        some, share = some.only(kept.tolist()), share[kept]
+        # The slope of the power mean: candidates above it lower it.
+        promising = [key for key, ratio in tops(problem, gains) if ratio > bound.mean(problem.budget)]
+        larger = some.with_more(promising)
+        news = len(larger.keys) - len(some.keys)
+        some, share = larger, np.append(share, np.full(news, 1e-3))
+        share = share / share.sum()
+        converged = bound.ratio < (1 + 0.5 * gap) * bound.mean(problem.budget)
+        if converged or not news or level < _QUICKLY or idle:
+            level = min(level + 1, len(_POWERS) - 1)
+    assert proof is not None
+    final, _ = bounded(problem, proof[1], proof[2], finer=True)
+    used = np.flatnonzero(weight * at.costs > _LEAST_WEIGHT * problem.budget)
+    weights = {at.keys[i]: float(weight[i]) for i in used}
+    return Allocation(weights, value, final.value(problem.budget), final)
 
 
-def _same(one: tuple[int, Float[np.ndarray, " _"]], other: tuple[int, Float[np.ndarray, " _"]]) -> bool:
-    return one[0] == other[0] and bool(np.allclose(one[1], other[1], atol=_ONE_PLACE, rtol=0.0))
+def lower_bound(
+    experiment: Experiment, covariance: Matrices, shares: OfTargets, *, finer: bool = False
+) -> Bound:
+    """The least criterion that any plan can have (see the module), over the grid or the finer one.
 
-
-def lower_bound(experiment: Experiment, covariance: Matrices, shares: OfTargets) -> Bound:
-    """The least criterion that any plan can have (see the module).
-
-    `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each group. Any of both gives
+    `covariance` is M(w)⁻¹ of a plan, `shares` multipliers π of the targets with sum 1 in each draw. Any of both gives
     a valid bound; those of the optimum give the largest.
     """
-    wide = _side_by_side(experiment.targets)
+    return bounded(experiment, covariance, shares, finer=finer)[0]
+
+
+def bounded(
+    problem: Experiment, covariance: Matrices, shares: OfTargets, finer: bool = False
+) -> tuple[Bound, list[Float[np.ndarray, " m"]]]:
+    """The bound, and the gains d_i of all candidates that it is made of."""
+    r, _, n, q = problem.targets.shape
+    wide = np.moveaxis(problem.targets, 2, 1).reshape(r, n, -1)
     y = covariance @ wide
-    shared = y * np.repeat(shares, experiment.targets.shape[3], axis=1)[:, None]
-    g = shared @ y.swapaxes(1, 2)
-    groups = len(g) // experiment.together
-    trace = float((shared * wide).sum()) / groups
-    prior = float((g * experiment.known).sum()) / groups
-    tops, ratio = [], 0.0
-    for number, family in enumerate(experiment.families):
-        places, largest = family.best(g / groups, _TOPS)
-        ratio = max(ratio, largest)
-        tops += [(number, place) for place in places]
-    return Bound(trace, prior, ratio, tuple(tops))
+    shared, draws = y * np.repeat(shares, q, axis=1)[:, None], r // problem.together
+    g = shared @ y.swapaxes(1, 2) / draws
+    of_families = problem.of_families(g)
+    gains = [family.gains(of_families) for family in problem.families]
+    ratio = max(float((gain / f.cost).max()) for gain, f in zip(gains, problem.families, strict=True))
+    if finer:
+        pairs = zip(gains, problem.families, strict=True)
+        near = [family for gain, family in pairs if (gain / family.cost).max() >= _HIGH * ratio]
+        ratio = max(ratio, *(family.between(of_families) for family in near))
+    here = float((shared * wide).sum()) / draws
+    return Bound(here, float((g * problem.known).sum()), ratio), gains
+
+
+def multipliers(some: Some, weight: Weight, power: float) -> OfTargets:
+    """π of the targets by the slope of a power mean."""
+    relative = some.experiment.relative(some.variances(weight))
+    return some.experiment.of_one(relative ** (power - 1.0))
+
+
+def tops(problem: Experiment, gains: Sequence[Float[np.ndarray, " m"]]) -> list[tuple[Key, float]]:
+    """The candidates with the largest gain for their cost, few of each family, and that ratio; largest first."""
+    found = []
+    for f, (gain, family) in enumerate(zip(gains, problem.families, strict=True)):
+        ratio = gain / family.cost
+        peaks = np.flatnonzero((ratio >= np.roll(ratio, 1)) & (ratio >= np.roll(ratio, -1)))
+        best = peaks[np.argsort(-ratio[peaks])][:_OF_FAMILY]
+        found += [((f, int(i)), float(ratio[i])) for i in best]
+    return sorted(found, key=lambda pair: -pair[1])[:_TOPS]
 
 
 def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> tuple[Allocation, float]:
@@ -471,81 +489,11 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
     return plan, least
 
 
-def rounded(experiment: Experiment, plan: Allocation) -> Allocation:
-    """A plan of whole numbers within the budget, and its proven distance from the best plan of any weights.
-
-    Weights are rounded down, the remaining budget goes where it lowers the criterion most for its cost, then
-    single candidates are exchanged while that lowers it further. Raises ValueError for a budget that pays for nothing,
-    and NotEstimableError for one that does not pay for all that the targets need.
-    """
-    problem = experiment.reduced()
-    chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
-    if chosen.costs.min() > problem.budget:
-        cheapest = f"the cheapest candidate costs: {chosen.costs.min():g}"
-        raise ValueError(f"the budget, {problem.budget:g}, is less than {cheapest}")
-    count = _filled(chosen, np.floor(plan.weight + 1e-9), plan.weight)
-    if chosen.value(count) > _HOPELESS * plan.value:
-        what = f"the budget, {problem.budget:g}, pays for {count.sum():.0f} of the candidates"
-        raise NotEstimableError(f"{what}, which do not determine all targets: raise it")
-    for _ in range(_EXCHANGES):
-        chosen, count, better = _exchanged(chosen, count)
-        if not better:
-            break
-    return chosen.plan(count, 0.0, plan.bound, plan.proof)
-
-
-def worth(experiment: Experiment, plan: Allocation) -> tuple[Weight, Weight]:
+def worth(experiment: Experiment, plan: Allocation) -> tuple[dict[Key, float], dict[Key, float]]:
     """The criterion without each candidate of a plan, and with one more of it, over that of the plan."""
-    problem = experiment.reduced()
-    chosen = _Some(problem, list(zip(plan.family.tolist(), plan.place, strict=True)))
-    value, units = chosen.value(plan.weight), np.eye(len(plan.weight))
-    without = [chosen.value(plan.weight * (1.0 - unit)) for unit in units]
-    added = [chosen.value(plan.weight + unit) for unit in units]
-    return np.array(without) / value, np.array(added) / value
-
-
-def _filled(some: _Some, count: Weight, weight: Weight) -> Weight:
-    """Spend the remaining budget, one candidate at a time."""
-    while True:
-        remaining = some.experiment.budget - some.costs @ count
-        can = np.flatnonzero(some.costs <= remaining * (1 + 1e-9))
-        if not len(can):
-            return count
-        # A plan that is not whole yet may not determine everything: a thousandth of the weights stands in for the rest.
-        base = count + 1e-3 * weight
-        phi = some.variances(base)
-        value, near = float(some.experiment.largest(phi).mean()), some.worst(phi)
-        gain = [(value - near.value(base + (np.arange(len(count)) == i))) / some.costs[i] for i in can]
-        count = count + (np.arange(len(count)) == can[int(np.argmax(gain))])
-
-
-def _exchanged(support: _Some, count: Weight) -> tuple[_Some, Float[np.ndarray, " _"], bool]:
-    """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
-    problem, value = support.experiment, support.value(count)
-    covariance = support.covariance(count)
-    phi = support.variances(count)
-    # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
-    shares = problem.of_one(problem.relative(phi) ** _SHARPNESS)
-    promising = lower_bound(problem, covariance, shares).tops
-    new = [top for top in promising if not any(_same(top, candidate) for candidate in support.chosen)]
-    used = np.flatnonzero(count)
-    support = _Some(problem, [*(support.chosen[i] for i in used), *new])
-    count = np.concatenate([count[used], np.zeros(len(new))])
-    y = covariance @ support.wide
-    slope = np.einsum("rsk,rk->s", support.gains(y), shares)
-    worst = support.worst(phi)
-    remaining = problem.budget - support.costs @ count
-    out, into = np.meshgrid(np.arange(len(used)), np.arange(len(count)), indexing="ij")
-    fits = (support.costs[into] - support.costs[out] <= remaining * (1 + 1e-9)) & (out != into)
-    promise = np.where(fits, slope[into] - slope[out], -np.inf)
-    for flat in np.argsort(-promise, axis=None)[:_TRIED]:
-        i, j = np.unravel_index(flat, promise.shape)
-        if not np.isfinite(promise[i, j]):
-            break
-        changed = count.copy()
-        changed[i] -= 1
-        changed[j] += 1
-        least = value * (1 - 1e-9)
-        if worst.value(changed) < least and support.value(changed) < least:
-            return support, changed, True
-    return support, count, False
+    some = Some(experiment.reduced(), plan.weights)
+    weight, units = np.array(list(plan.weights.values())), np.eye(len(plan.weights))
+    value = some.value(weight)
+    without = [some.value(weight * (1.0 - unit)) / value for unit in units]
+    added = [some.value(weight + unit) / value for unit in units]
+    return dict(zip(some.keys, without, strict=True)), dict(zip(some.keys, added, strict=True))
