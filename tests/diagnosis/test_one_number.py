@@ -21,7 +21,7 @@ def test_every_command_states_the_largest_of_one_table():
     limits = walop.limits(fitted)
     facts = dict(fitted.display().facts)
     level = re.sub("p ≤ 5 %", "", limits.protection_in_words())
-    (check,) = [one for one in walop.certify(fitted).checks if one.name == "protection"]
+    (check,) = [one for one in walop.check(fitted)["commissioning"].checks if one.name == "protection"]
     assert percent(facts["undetectable"]) == percent(level) == percent(check.found)
     worst = limits.mistakes[0]
     assert worst.name in facts["caused by"]
