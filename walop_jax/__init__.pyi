@@ -2,15 +2,13 @@
 
 from walop_jax.calibration.calibration import Calibration as Calibration
 from walop_jax.calibration.residual_map import residual_map as residual_map
-from walop_jax.commands.affected import affected as affected
 from walop_jax.commands.apply import apply as apply
-from walop_jax.commands.certify import certify as certify
+from walop_jax.commands.check import check as check
 from walop_jax.commands.cite import cite as cite
 from walop_jax.commands.compare import compare as compare
 from walop_jax.commands.demo import demo as demo
 from walop_jax.commands.diagnose import diagnose as diagnose
 from walop_jax.commands.docs import docs as docs
-from walop_jax.commands.epoch import epoch as epoch
 from walop_jax.commands.exposures import exposures as exposures
 from walop_jax.commands.gather import gather as gather
 from walop_jax.commands.inputs import read as read
@@ -24,7 +22,6 @@ from walop_jax.commands.matrix import matrix as matrix
 from walop_jax.commands.model import model as model
 from walop_jax.commands.plan import plan as plan
 from walop_jax.commands.plot import plot as plot
-from walop_jax.commands.quality import quality as quality
 from walop_jax.commands.refit import refit as refit
 from walop_jax.commands.report import report as report
 from walop_jax.commands.sample import sample as sample
@@ -32,7 +29,6 @@ from walop_jax.commands.simulate import simulate as simulate
 from walop_jax.commands.stack import stack as stack
 from walop_jax.commands.standards import standards as standards
 from walop_jax.commands.trace import trace as trace
-from walop_jax.commands.watch import watch as watch
 from walop_jax.data.calset import from_arrays as from_arrays
 from walop_jax.data.records import CalibrationSet as CalibrationSet
 from walop_jax.data.records import FilterCurve as FilterCurve

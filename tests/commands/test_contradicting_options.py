@@ -70,7 +70,7 @@ def test_an_answer_does_not_replace_the_diagnosis(call, here: Path):
     assert sorted(entry.name for entry in Path("FOUND").iterdir()) == before
 
 
-@pytest.mark.parametrize("name", ["refit", "quality", "matrix"])
+@pytest.mark.parametrize("name", ["refit", "check", "matrix"])
 def test_an_output_without_a_name_lacks_it(call, name: str):
     """The program said that the command takes no output."""
     refused = call(name, "RUN", "-o")
@@ -129,7 +129,7 @@ def test_catalogues_of_cameras_that_exist_are_refused_before_the_work(call, here
     assert "sky_E1.fits: exists already" in refused.stderr
 
 
-@pytest.mark.parametrize("command", ["epoch", "compare"])
+@pytest.mark.parametrize("command", ["check", "compare"])
 def test_sets_are_read_with_the_kinds_of_exposures_of_the_calibration(command: str, fitted, monkeypatch):
     def read(data: Any, instrument: Any = None) -> Any:
         raise Begun(instrument.name)
@@ -137,7 +137,7 @@ def test_sets_are_read_with_the_kinds_of_exposures_of_the_calibration(command: s
     monkeypatch.setattr(f"walop_jax.commands.{command}.set_of", read)
     old, new = fitted.calibration, fitted.calset
     with pytest.raises(Begun, match="WALOP-SOUTH"):
-        walop.epoch(old, new) if command == "epoch" else walop.compare(new, old)
+        walop.check(old, new) if command == "check" else walop.compare(new, old)
 
 
 def test_a_run_reads_its_data_with_the_kinds_of_exposures_of_its_instrument(run, monkeypatch):
@@ -167,28 +167,49 @@ def test_a_catalogue_that_cannot_be_read_leaves_the_others_their_tables(call, ru
     assert "a.csv: permission denied" in done.stderr
 
 
-def test_watch_refuses_what_apply_refuses(call, here: Path):
+def test_check_refuses_what_apply_refuses(call, here: Path):
     """The angle of a plate that stood in the beam in no exposure of the calibration: was it in the beam now?"""
     Path("stars.csv").write_text("X,Y,CHWP_ANGLE," + ",".join(f"N{k},N{k}_ERR" for k in range(4)) + "\n")
     with Path("stars.csv").open("a") as stream:
         stream.write("0,0,45" + ",10000,100" * 4 + "\n")
-    for line in (("apply", "RUN", "stars.csv", "-o", "out.csv"), ("watch", "RUN", "stars.csv")):
+    for line in (("apply", "RUN", "stars.csv", "-o", "out.csv"), ("check", "RUN", "stars.csv")):
         assert "no exposure of the calibration had CHWP in the beam" in call(*line).stderr
 
 
-def test_a_figure_that_cannot_be_written_is_refused_before_the_table_is(call, here: Path):
-    refused = call("quality", "RUN", "-o", "nights.ecsv", "--figure", "nights.xyz")
-    assert "nights.xyz: is no picture that can be written" in refused.stderr
+def test_an_output_that_exists_is_refused_before_the_row_is_added(call, here: Path):
+    (here / "OUT").mkdir()
+    Path("OUT/check.json").write_text("mine")
+    refused = call("check", "RUN", "--append", "nights.ecsv", "-o", "OUT")
+    assert "--overwrite" in refused.stderr
     assert not Path("nights.ecsv").exists()
+    assert Path("OUT/check.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("RUN", "--against", "RUN"), "give the catalogues that are compared"),
+        (("RUN", "--limits", "l.toml"), "those of the numbers that --append writes"),
+        (("RUN", "stars.csv", "--limit", "0", "--against", "RUN"), "must be above 0"),
+        (("RUN", "stars.csv", "--limit", "1"), "a shift between two calibrations"),
+        (("RUN", "stars.csv", "--goal", "0.5"), "asked of RUN alone"),
+        (("RUN", "--force"), "it is about stars"),
+        (("RUN", "--goal", "0"), "is no error of p"),
+    ],
+)
+def test_options_of_check_that_cannot_be_meant_are_refused(call, here: Path, words, reason: str):
+    refused = call("check", *words)
+    assert refused.exit_code == 2
+    assert reason in refused.stderr
 
 
 def test_a_product_of_another_name_is_not_judged_by_the_data_of_the_run_beside_it(run, tmp_path, monkeypatch):
     for name in ("calibration.fits", "earlier.fits"):
         shutil.copy(run / "calibration.fits", tmp_path / name)
     monkeypatch.setattr(walop.Run, "calset", property(_begin))
-    assert walop.certify(tmp_path / "earlier.fits").checks
+    assert walop.check(tmp_path / "earlier.fits")["commissioning"].checks
     with pytest.raises(Begun):
-        walop.certify(tmp_path)
+        walop.check(tmp_path)
 
 
 # ---------------------------------------------------------------------------------------- what to type next
@@ -209,5 +230,5 @@ def test_suggested_paths_with_blanks_can_be_typed(call, calset_file, here: Path)
 
 def test_a_calibration_that_is_not_fit_for_use_is_not_suggested_for_use(call, here: Path):
     """A no-go ended with the advice to correct stars with it."""
-    done = call("certify", "RUN")
+    done = call("check", "RUN")
     assert (done.exit_code == 3) == ("walop-jax apply" not in done.stderr)

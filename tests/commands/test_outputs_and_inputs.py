@@ -44,11 +44,11 @@ def test_an_output_that_is_an_input_is_refused_and_nothing_is_lost(run, tmp_path
         walop.gather(files, gaia=str(stars), output=stars, overwrite=True)
 
 
-def test_a_calibration_that_is_compared_is_not_replaced(run, tmp_path):
+def test_a_calibration_that_is_compared_is_not_replaced(run, calset_file, tmp_path):
     old = shutil.copytree(run, tmp_path / "old")
     for given in (old, old / "calibration.fits", walop.read(old)):
         with pytest.raises(UsageError, match=LOST):
-            walop.epoch(given, "night.fits", output=old, overwrite=True)
+            walop.check(given, calset_file, output=old, overwrite=True)
 
 
 def test_other_commands_keep_their_inputs(tmp_path):

@@ -126,7 +126,7 @@ def test_what_is_fitted_with_an_element_of_ones_own_is_read(own: Path, call):
     for line in (
         ("matrix", "RUN", "--points", "p.csv", "-o", "m.fits"),
         ("trace", "RUN", "--x", 0.1),
-        ("certify", "RUN"),
+        ("check", "RUN"),
         ("report", "RUN"),
         ("cite", "RUN"),
     ):

@@ -18,18 +18,21 @@ from .conftest import FittedSet
 
 
 def test_epochs_of_one_and_the_same_set(fitted: FittedSet, tmp_path: Path):
-    found = walop.epoch(fitted.run, fitted.calset, output=tmp_path / "EPOCH")
+    answer = walop.check(fitted.run, fitted.calset, output=tmp_path / "EPOCH")
+    found = answer["epoch"]
+    assert answer.words == "go, with reservations"
+    assert answer.reasons[0].what.startswith("these are the data from which the old calibration was made")
     # The same data: the same minimum.
     assert found.fits
     assert max(abs(entry.new - entry.old) / entry.error for entry in found.moved) < 1e-3
     assert found.display().facts == (("old and new", "the same data: nothing can have changed"),)
-    document = json.loads((tmp_path / "EPOCH" / "epoch.json").read_text())
+    document = json.loads((tmp_path / "EPOCH" / "check.json").read_text())["epoch"]
     assert document["fits"] is True
     assert document["new"] == [entry.sha256 for entry in fitted.calibration.inputs]
     assert walop.report(tmp_path / "EPOCH").missing == ()
-    assert "still fits" in (tmp_path / "EPOCH" / "report.html").read_text()
+    assert "go, with reservations" in (tmp_path / "EPOCH" / "report.html").read_text()
     with pytest.raises(DataError, match="no such file"):
-        walop.epoch(fitted.run / "other.fits", fitted.calset)
+        walop.check(fitted.run / "other.fits", fitted.calset)
 
 
 def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
@@ -38,7 +41,7 @@ def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
     asked: dict[str, object] = {}
     monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda result, seed: result.judged(["odd"]))
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *_, **how: asked.update(how))
-    assert call("epoch", fitted.run, fitted.calset, "--seed", 5).exit_code == 3
+    assert call("check", fitted.run, fitted.calset, "--seed", 5).exit_code == 3
     assert asked["as_written"] is True
     assert asked["seed"] == 5
 

@@ -21,7 +21,7 @@ CALLS = {
     "refit": lambda g, **k: walop.refit(g.calset, **k),
     "limits": lambda g, **k: walop.limits(g.calset, **k),
     "compare": lambda g, **k: walop.compare(g.calset, **k),
-    "epoch": lambda g, **k: walop.epoch(g.run, g.calset, **k),
+    "check": lambda g, **k: walop.check(g.run, g.calset, **k),
 }
 
 

@@ -13,7 +13,7 @@ from walop_jax.commands.program import step_counter
 from walop_jax.io.progress import Stage
 
 RANDOM = (
-    "simulate", "sample", "diagnose", "limits", "compare", "plan", "refit", "epoch",
+    "simulate", "sample", "diagnose", "limits", "compare", "plan", "refit", "check",
 )  # fmt: skip
 
 

@@ -76,7 +76,7 @@ def test_a_wrong_number_of_the_set_is_the_explanation():
     assert diagnosis.verdict == "wrong_number"
     assert not diagnosis.complete
     shown = diagnosis.display()
-    assert shown.title.startswith("Diagnosis: wrong number; fit not trusted")
+    assert shown.title.startswith("Diagnosis (wrong number): no go")
     told = dict(shown.facts)["found"]
     assert told.startswith("MJD of sky exposures changed by −0.08")
 

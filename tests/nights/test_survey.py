@@ -176,7 +176,7 @@ def test_tracks_and_tables(quiet):
     assert rows["DEVIATION"][1] == pytest.approx(change, abs=1e-6 * rows["DEVIATION_ERR"][1])
     assert np.sum(nights["CHI2"]) == pytest.approx(quiet.solution.chi2)
     assert np.all(np.abs(quiet.excess) < 5.0)
-    assert "Survey of WALOP-SOUTH: trusted" in repr(quiet)
+    assert "Survey of WALOP-SOUTH: go" in repr(quiet)
 
 
 def test_kept_nights_are_stacked(quiet, sets, single, tmp_path):
@@ -376,7 +376,7 @@ def test_the_page_runs_as_it_stands(sets, tmp_path, monkeypatch, capsys):
     names: dict[str, object] = {}
     for block in blocks:
         exec(compile(textwrap.dedent(block), "nights", "exec"), names)
-    assert "Survey of WALOP-SOUTH: trusted" in capsys.readouterr().out
+    assert "Survey of WALOP-SOUTH: go" in capsys.readouterr().out
     assert len(Table.read(tmp_path / "tracks.fits")) == 3 * len(names["survey"].data.names)
     turn = names["again"].tracks
     turn = turn[turn["NAME"] == "clp_zero.angle"]

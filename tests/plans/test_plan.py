@@ -195,7 +195,7 @@ def test_the_plan_of_a_night_contains_what_a_go_needs(planned):
 
 
 def test_a_plan_without_the_sky_is_no_go_and_its_first_line_says_so(small, field):
-    """0.20 % of telescope polarisation, as `certify` would say it of a fit."""
+    """0.20 % of telescope polarisation, as `check` would say it of a fit."""
     indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
     plan = plan_from(indoors, 15.0, criterion_by_name(small, field, "worst"), field)
     first = repr(plan).splitlines()[0]

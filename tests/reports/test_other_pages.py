@@ -39,7 +39,6 @@ def written(folder: Path, kind: str, **document: Any) -> tuple[str, tuple[str, .
 
 DOCUMENTS: dict[str, dict[str, Any]] = {
     "comparison": {"trusted": True},
-    "epoch": {"fits": True, "new_trusted": True},
     "plan": {},
     "survey": {
         "trusted": True,
@@ -48,8 +47,7 @@ DOCUMENTS: dict[str, dict[str, Any]] = {
         "events": [],
         "by_night": [{"night": 1, "mjd": 1.9, "chi2": 9.0, "dof": 9, "excess": 0.0}],
     },
-    "watch": {"holds": True},
-    "affected": {},
+    "check": {"go": True, "watch": {"holds": True, "shown": SHOWN.document()}},
 }
 
 
@@ -62,12 +60,12 @@ def test_displayed_text_is_on_the_page(tmp_path: Path, kind: str):
     for words in (SHOWN.title, SHOWN.facts[0][1], *SHOWN.notes):
         assert words in page.text
     assert html.index(SHOWN.facts[0][1][:15]) < html.index("<main>")
-    lacking = {key: False for key in DOCUMENTS[kind] if key in ("trusted", "fits", "new_trusted", "holds")}
+    lacking = {key: False for key in DOCUMENTS[kind] if key in ("trusted", "go")}
     if lacking:
         html, _ = written(tmp_path, kind, **DOCUMENTS[kind] | lacking, warnings=["χ²/dof = 5.99"])
         assert 'class="verdict good"' not in html
         assert "χ²/dof = 5.99" in html.partition("<main>")[0].replace("\N{NO-BREAK SPACE}", " ")
-        assert ('class="untrusted"' in html) == (kind != "watch")
+        assert ('class="untrusted"' in html) == (kind != "check")
 
 
 @pytest.mark.parametrize("name", [name for name in names.DOCUMENTS if name != "summary"])
@@ -88,7 +86,7 @@ def test_a_document_that_holds_nothing_displayed_is_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "lacking"), [("comparison", "comparison_map.png", 3), ("watch", "watch.png", 0)]
+    ("kind", "name", "lacking"), [("comparison", "comparison_map.png", 3), ("check", "watch.png", 0)]
 )
 def test_pictures_that_the_command_has_drawn(tmp_path: Path, kind: str, name: str, lacking: int):
     (tmp_path / name).write_bytes(b"\x89PNG")
@@ -103,15 +101,19 @@ def test_an_epoch_shows_what_has_changed_of_the_matrix(tmp_path: Path):
         (tmp_path / name).mkdir()
         handmade_run.make_refit(tmp_path / name)
     (tmp_path / "new" / "summary.json").unlink()
-    html, missing = written(tmp_path / "new", "epoch", fits=True, old_file=str(tmp_path / "old"))
+
+    def epoch(folder: Path, **document: Any) -> tuple[str, tuple[str, ...]]:
+        return written(folder, "check", epoch={**document, "shown": SHOWN.document()})
+
+    html, missing = epoch(tmp_path / "new", fits=True, old_file=str(tmp_path / "old"))
     assert missing == ()
     assert len(Page(html).images) == 1
-    html, missing = written(tmp_path, "epoch", fits=False, old_file="lost.fits")
+    html, missing = epoch(tmp_path, fits=False, old_file="lost.fits")
     assert "The change of the instrument matrix is not drawn" in missing[0]
-    html, missing = written(tmp_path, "epoch", fits=False, old_file=None)
+    html, missing = epoch(tmp_path, fits=False, old_file=None)
     assert "the old calibration was in memory" in missing[0]
     for same in ({}, {"fits": None}, {"fits": True, "same": True}):
-        html, missing = written(tmp_path / "new", "epoch", **same, old_file=str(tmp_path / "old"))
+        html, missing = epoch(tmp_path / "new", **same, old_file=str(tmp_path / "old"))
         assert (missing, Page(html).images) == ((), [])
 
 

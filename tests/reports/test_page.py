@@ -124,14 +124,15 @@ def test_a_no_go_stands_first(tmp_path, blank_figures):
     folder = handmade_run.make_refit(tmp_path / "run")
     row = ("NO", "p known to 0.050 % in 50 % of the field", "0.088 % in 50 % of the field, 0.050 % allowed")
     shown = Display(
-        "run/calibration.fits: NO GO", head=("", "requirement", "result"), rows=(row,), notes=("more light",)
+        "run/calibration.fits", head=("", "requirement", "result"), rows=(row,), notes=("more light",)
     )
-    told = {"go": False, "requirements": [], "shown": shown.document()}
-    (folder / "commissioning.json").write_text(json.dumps(told))
+    told = {"go": False, "answer": "no go", "product": handmade_run.product().content_hash()}
+    told["commissioning"] = {"shown": shown.document()}
+    (folder / "check.json").write_text(json.dumps(told))
     text = render(read_run(folder))[0]
     page = Page(text)
     assert page.headings[0] == "Go or no-go"
-    assert text.index("NO GO") < text.index("Fit of WALOP-SOUTH")
+    assert text.index("No go") < text.index("Fit of WALOP-SOUTH")
     assert list(row) in page.rows
     assert "more light" in page.text
     assert 'class="verdict good"' not in text

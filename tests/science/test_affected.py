@@ -15,7 +15,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.user_tables import in_memory
 from walop_jax.fit.verdict import Structure
-from walop_jax.science.affected import affected, shift
+from walop_jax.science.affected import Affected, affected, shift
 from walop_jax.science.apply import results_of
 from walop_jax.science.catalogue import read_catalogue
 
@@ -31,6 +31,11 @@ def table(old):
     made, _ = stars(AnalysisVectors(old), 60, np.random.default_rng(3), flux=4e7)
     made["MJD"] = np.repeat([61220.9, 61221.9], 30)
     return made
+
+
+def changes(old: Calibration, new: Calibration, *tables, **options) -> Affected:
+    """What `check NEW --against OLD TABLES` finds."""
+    return walop.check(new, *tables, against=old, **options)["affected"]
 
 
 def moved(calibration: Calibration, name: str, sigmas: float) -> Calibration:
@@ -60,7 +65,7 @@ def test_a_parameter_off_by_its_error_shifts_stars_by_the_error_that_it_makes(ol
 
 
 def test_the_same_calibration_changes_nothing(old, table):
-    found = walop.affected(old, old, table)
+    found = changes(old, old, table)
     assert found.again == ()
     assert [night.largest for night in found.nights] == [0.0, 0.0]
     assert [night.stars for night in found.nights] == [30, 30]
@@ -73,20 +78,22 @@ def test_a_star_of_two_nights_is_one_of_each(old, table):
     rows["MJD"] = np.concatenate(
         [np.tile([61220.9, 61221.9], 10), np.full(20, 61220.9), np.tile([np.nan, 61221.9], 10)]
     )
-    found = walop.affected(old, old, rows)
+    found = changes(old, old, rows)
     assert [(night.night, night.stars) for night in found.nights] == [(61220.0, 20), (61221.0, 20)]
 
 
 def test_calibrations_and_catalogues_of_other_instruments_are_told(old, table, monkeypatch):
     other = table.copy()
     other.meta["INSTRUME"] = "WALOP-NORTH"
-    (warning,) = walop.affected(old, old, other).warnings
+    (warning,) = changes(old, old, other).warnings
     assert "INSTRUME of the table is WALOP-NORTH, the calibration is of WALOP-SOUTH" in warning
     new = dataclasses.replace(old, path=Path("NEW"))
     names = property(lambda it: "WALOP-NORTH" if it.path == new.path else "WALOP-SOUTH")
     monkeypatch.setattr(Calibration, "instrument", names)
-    with pytest.raises(ValueError, match="OLD is a calibration of WALOP-SOUTH, NEW one of WALOP-NORTH"):
-        walop.affected(old, new, table)
+    with pytest.raises(
+        ValueError, match="OLD_RUN is a calibration of WALOP-SOUTH, NEW_RUN one of WALOP-NORTH"
+    ):
+        changes(old, new, table)
 
 
 def test_what_must_be_made_again_is_named(old, table):
@@ -94,7 +101,7 @@ def test_what_must_be_made_again_is_named(old, table):
     new = moved(old, "collimator.u", 5.0)
     moved_by = 5.0 * old["collimator.u"].sigma
     reduced = walop.apply(old, table)
-    found = walop.affected(old, new, [table, reduced])
+    found = changes(old, new, table, reduced)
     first, second = found.nights[:2]
     assert found.again == ("catalogue 1", "catalogue 2")
     first = found.nights[0]
@@ -108,9 +115,14 @@ def test_what_must_be_made_again_is_named(old, table):
     assert first.median > found.limit
     assert first.u == pytest.approx(-moved_by, rel=0.05)
     assert second.u == pytest.approx(first.u, rel=0.05)
-    assert walop.affected(old, new, table, limit=1e3).again == ()
-    again = walop.affected(old, new, walop.apply(new, table))
+    assert changes(old, new, table, limit=1e3).again == ()
+    again = changes(old, new, walop.apply(new, table))
     assert again.warnings == ("catalogue 1: was made with the new calibration already",)
+    answer = walop.check(new, table, reduced, against=old)
+    assert not answer.go
+    assert [one.what.split()[1] for one in answer.reasons] == ["1", "2"]  # catalogue 1, catalogue 2
+    assert answer.reasons[0].off == pytest.approx(moved_by, rel=0.05)
+    assert "walop-jax apply NEW catalogue 1" in answer.reasons[0].cure
     document = found.document()
     assert document["again"] == ["catalogue 1", "catalogue 2"]
     assert "again" in found.display().text()
@@ -134,6 +146,6 @@ def test_results_that_are_lost_are_made_again(old, table):
     """The new calibration takes the middle of the field for beyond its own: no result there."""
     x0, x1, y0, y1 = old.field
     small = dataclasses.replace(old, field=(x0 / 9, x1 / 9, y0 / 9, y1 / 9))
-    found = walop.affected(old, small, table)
+    found = changes(old, small, table)
     assert found.nights[0].lost > 0
     assert found.again == ("catalogue 1",)

@@ -8,8 +8,10 @@ import pytest
 from small_run import small_fit
 
 from walop_jax.calibration.product import Validity
+from walop_jax.data.inspection import inspect
+from walop_jax.fit.verdict import Verdict
 from walop_jax.science.commissioning import Certificate, requirements
-from walop_jax.science.field_accuracy import FieldAccuracy
+from walop_jax.science.field_accuracy import FieldAccuracy, for_stars
 
 FIELD = np.linspace(1e-4, 4.9e-4, 100).reshape(10, 10)  # median 2.95e-4
 
@@ -23,7 +25,12 @@ def accuracy(**changes):
 
 def certificate(result, accuracy):
     asked = requirements(result.checked_verdict(), "", accuracy, result.calset)
-    return Certificate(Path("calibration.fits"), (), asked, Validity((0.0, 0.0), (), (0.0, 0.0)), "", ())
+    verdict = for_stars(result.checked_verdict(), accuracy, inspect(result.calset).findings)
+    found = Certificate(
+        Path("calibration.fits"), (), asked, Validity((0.0, 0.0), (), (0.0, 0.0)), "", (), verdict
+    )
+    assert found.go == verdict.go == Verdict(against=found.against).go
+    return found
 
 
 def test_a_go():
@@ -49,8 +56,12 @@ def test_a_go():
 def test_a_no_go(change, words):
     found = certificate(small_fit(), accuracy(**change))
     assert not found.go
-    assert "NO GO" in found.display().title
+    assert "no go" in found.display().title
     assert words in found.missing[0]
+    first = found.verdict.reasons[0]
+    assert first.blocking
+    assert words.partition(": ")[0] in first.words
+    assert first.off == pytest.approx(np.median(change["error"]))
     assert found.document()["go"] is False
 
 
@@ -66,8 +77,8 @@ def test_an_error_that_is_not_known_is_no_go(change):
     assert np.isnan(found.reached)
     assert not certificate(small_fit(), found).go
     assert found.document()["good_enough"] is False
-    assert dict(found.facts())["good for 0.1 %"].startswith("no: ")
-    assert "plate at 22.5°" in dict(found.facts())["what to do"]
+    assert dict(found.facts())["good for 0.1 %"].startswith("no, for ")
+    assert any("plate at 22.5°" in one.cure for one in for_stars(small_fit().verdict, found).reasons)
 
 
 def test_what_is_not_trusted_is_no_go():
@@ -81,6 +92,10 @@ def test_what_is_not_trusted_is_no_go():
     ]
     assert not any("% of the field" in one.what for one in refused.requirements)
     assert "diagnose" in certificate(bad, accuracy()).missing[0]
+    assert (
+        refused.verdict.first_line
+        == "no go: the residuals hold patterns; walop-jax diagnose looks for the cause"
+    )
 
 
 def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
@@ -92,6 +107,9 @@ def test_mistakes_that_could_hide_are_told_but_forbid_nothing():
     )
     assert found.go
     assert any("error of 0.30 %" in text and "field positions" in text for text in found.missing)
+    assert found.verdict.words == "go, with reservations"
+    assert found.verdict.reasons[0].off == 3e-3
+    assert found.verdict.reasons[0].cure == "check the field positions"
     assert "goes undetected: the scale of X and Y" in found.display().text()
 
 

@@ -100,22 +100,25 @@ def test_validity_stands_in_the_header(product, tmp_path):
     assert header["FILTER1"] == "SDSS-r"
 
 
-def test_certify_from_the_command_line(product, tmp_path):
+def test_a_calibration_is_checked_from_the_command_line(product, tmp_path):
     write_calibration(tmp_path / "good.fits", product)
-    result = CliRunner().invoke(app, ["certify", str(tmp_path / "good.fits"), "--json"])
+    result = CliRunner().invoke(app, ["check", str(tmp_path / "good.fits"), "--json"])
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout)
-    assert told["valid"] is True
-    assert told["content"] == product.content_hash()
-    assert told["parents"] == [product.inputs[0].sha256]
+    assert told["go"] is True
+    assert told["product"] == product.content_hash()
+    assert told["commissioning"]["valid"] is True
+    assert told["commissioning"]["content"] == product.content_hash()
+    assert told["commissioning"]["parents"] == [product.inputs[0].sha256]
     bad = dataclasses.replace(
-        product, verdict=dataclasses.replace(product.verdict, against=(Doubt(Quality.DOUBTED, ""),))
+        product, verdict=dataclasses.replace(product.verdict, against=(Doubt(Quality.DOUBTED, "odd"),))
     )
     write_calibration(tmp_path / "bad.fits", bad)
-    result = CliRunner().invoke(app, ["certify", str(tmp_path / "bad.fits"), "--quiet"])
-    assert result.exit_code == 1
-    assert "explains the data" in result.stderr
-    assert result.stderr.count("\n") == 1
+    result = CliRunner().invoke(app, ["check", str(tmp_path / "bad.fits")])
+    assert result.exit_code == 3
+    assert result.stdout.startswith(f"{tmp_path / 'bad.fits'}: no go: odd; walop-jax diagnose")
+    assert "FAILED  explains the data" in result.stdout
+    assert "Next" not in result.stderr
 
 
 # ------------------------------------------------------------------------------------------------- epochs

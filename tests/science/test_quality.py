@@ -17,6 +17,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.io.folder import locked
 from walop_jax.reports.survey_figures import quality_figure
 from walop_jax.science.quality import (
+    QualityRow,
     Standard,
     append,
     judge,
@@ -194,9 +195,9 @@ def test_other_tables_are_left_alone(row, tmp_path: Path):
 def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path):
     """Before the run, which is not there, is asked for."""
     with pytest.raises(DataError, match="QUALITY: has no extension of a table"):
-        walop.quality(tmp_path / "NO-RUN", output=tmp_path / "QUALITY")
+        walop.check(tmp_path / "NO-RUN", append=tmp_path / "QUALITY")
     with pytest.raises(DataError, match="does not exist; create it first"):
-        walop.quality(tmp_path / "NO-RUN", output=tmp_path / "there" / "q.ecsv")
+        walop.check(tmp_path / "NO-RUN", append=tmp_path / "there" / "q.ecsv")
 
 
 def test_the_figure_shows_every_night(row):
@@ -216,8 +217,26 @@ def test_the_figure_shows_every_night(row):
 def test_a_run_from_disk_and_one_in_memory_give_one_row(tmp_path: Path):
     fit = small_fit()
     fit.save(tmp_path / "RUN")
-    table = walop.quality([tmp_path / "RUN", fit], output=tmp_path / "q.ecsv", figure=tmp_path / "q.png")
-    assert len(table) == 1
-    assert (tmp_path / "q.png").stat().st_size > 10_000
-    again = walop.quality(dataclasses.replace(fit), output=tmp_path / "q.ecsv")
-    assert len(again) == 1
+    for run in (tmp_path / "RUN", fit, dataclasses.replace(fit)):
+        answer = walop.check(run, append=tmp_path / "q.ecsv", output=tmp_path / "OUT", overwrite=True)
+        assert len(answer["quality"].table) == 1
+        assert answer["quality"].mine["CHI2DOF"] == pytest.approx(fit.chi2 / fit.dof)
+    assert (tmp_path / "OUT" / "quality.png").stat().st_size > 10_000
+    assert len(Table.read(tmp_path / "q.ecsv")) == 1
+
+
+def test_numbers_outside_their_limits_are_reasons_with_what_they_do_to_stars(row, tmp_path: Path):
+    """An angle off by 0.3° turns 5 % of polarisation by 2 · 0.05 · 0.3°; a zero of 1 % is 1 %."""
+    limits = read_limits()
+    odd = night(row, 1, ANGLE=0.3, ANGLE_ERR=0.02, ZERO_U=-0.01, TRUSTED=False)
+    table, _ = append(tmp_path / "q.ecsv", table_of_nights([odd]), limits)
+    found = QualityRow(table, table[0], limits, None)
+    angle, zero, trusted = found.against
+    assert angle.off == pytest.approx(0.1 * np.deg2rad(0.3))
+    assert angle.what.startswith("night 61221: ANGLE = 0.300 ± 0.020 deg, allowed −0.2 to 0.2 deg")
+    assert "ROTATOR" in angle.cure
+    assert zero.off == pytest.approx(0.01)
+    assert trusted.off is None
+    assert all(one.blocking for one in found.against)
+    quiet = dataclasses.replace(found, mine=judge(table_of_nights([night(row, 1, ANGLE=0.0)]), limits)[0])
+    assert quiet.against == ()

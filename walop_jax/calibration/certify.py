@@ -64,7 +64,7 @@ def lacks(
 ) -> Iterator[Finding]:
     """What lists of exposures, taken or planned, lack together for a go, whatever they count.
 
-    The faults that `inspect` would find, and the mistakes that `certify` would not call measured.
+    The faults that `inspect` would find, and the mistakes that `check` would not call measured.
     """
     yield from (finding for finding in about_exposures(*taken) if finding.severity == "fault")
     if not sees_the_sky(*taken):

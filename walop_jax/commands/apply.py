@@ -24,6 +24,7 @@ from walop_jax.commands.command import (
 from walop_jax.commands.gather import gather
 from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
+from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming
 
 if TYPE_CHECKING:
@@ -100,8 +101,9 @@ def apply(
     2097152 no ROTATOR where others have one, 4194304 the counts of another row; bits of the calibration itself are
     added to all rows. Copies of a row are left out; columns that are not used are named.
 
-    The first line says whether the catalogue is to be trusted. Exit code 3 where it is not: the calibration is not
-    trusted, it is of another instrument, the stars together contradict it, or most stars are flagged. Where they
+    The first line is the verdict on the catalogue: go, go with reservations, or no go, with the first reason and its
+    remedy. No go, and exit code 3, where the calibration is not trusted, where it is of another instrument, where the
+    stars together contradict it, or where most stars are flagged. Where they
     contradict it by more than an instrument changes, other readings of the catalogue are tried (orders of the cameras,
     signs and turns of ROTATOR, a shifted pointing, mirrored fields, magnitudes, filters, gains), and the one that mends
     it is said first.
@@ -163,9 +165,12 @@ def apply(
         seen_twice = overlap(used, rows, force=force)
     job.begin("writing")
     columns = added.stokes_columns(stars, rows.star, debias)
-    verdict = verdict_on(used, rows, stars, seen_twice)
+    where = "Catalogue" if output is None else str(output)
+    verdict = dataclasses.replace(
+        verdict_on(used, rows, stars, seen_twice), subject=where, stars=added.errors_in_words(columns)
+    )
     warnings = [
-        *verdict.reservations,
+        *(text for text in verdict.reservations if text not in held.warnings),
         *gathering_remarks,
         *added.sentences(rows, stars, held.design.cameras.names),
     ]
@@ -182,7 +187,8 @@ def apply(
         remade=in_common_form if common else None,
         extra={
             "trusted": verdict.trusted,
-            "doubts": list(verdict.doubts),
+            **verdict.answers(),
+            "doubts": list(verdict.objections),
             "reservations": list(verdict.reservations),
             "stars": len(stars.qu),
             "seconds": job.seconds,
@@ -194,17 +200,14 @@ def apply(
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     zones = f"; {crossed} in zones of high cross-talk (FLAG 16)" if crossed else ""
     size = f"{len(outcome.value)} rows, {len(stars.qu)} stars, {job.seconds:.1f} s"
-    where = "Catalogue" if output is None else output
-    text = f"{where}: {verdict.words}\n{size}{added.errors_in_words(columns)}{zones}"
-    step = (
-        shlex.join(("topcat", str(output))) if common else typed("watch", calibration, output, "-o", "WATCH")
-    )
-    about = [] if not verdict.doubts else [f"{table.path}: {doubt}" for doubt in verdict.doubts]
+    shown = Display("", (("table", f"{size}{zones}"),))
+    step = shlex.join(("topcat", str(output))) if common else typed("check", calibration, output)
+    about = [f"{table.path}: {doubt}" for doubt in verdict.objections]
     others = [text for text in outcome.warnings if held.verdict.trusted or text not in held.warnings]
     warnings = (*about, *others)
     return dataclasses.replace(
         outcome,
-        text=text,
+        text=verdict.on_top_of(shown).text(),
         warnings=warnings,
         trusted=verdict.trusted,
         next=(step,) if verdict.trusted else (),
@@ -255,7 +258,7 @@ def _apply_to_each(
     A table appears whole or not at all, and one that is there is not made again: the same command goes on with what an
     interrupted one has left. Errors of a file fail the whole, which names them, after all others are made.
     """
-    from walop_jax.io.text import some
+    from walop_jax.fit.verdict import Doubt, Quality, Verdict
     from walop_jax.likelihood.workers import executor_of, mapped
 
     if output is None:
@@ -280,26 +283,32 @@ def _apply_to_each(
     if existing := len(files) - len(calls):
         what = f"{existing} of {len(files)} tables were there already"
         warnings.append(f"{what}, and are left; --overwrite makes them again")
-    doubted = [str(o.content["output"]) for o in ended if not o.failure and not o.trusted]
+    doubts = {
+        str(o.content["output"]): o.content["doubts"][0] for o in ended if not o.failure and not o.trusted
+    }
     made = {str(place) for _, place in pairs}
-    doubted += [str(place) for place in places if str(place) not in made and _is_doubted(place)]
+    doubts |= {str(p): text for p in places if str(p) not in made and (text := _doubt_of(p))}
+    doubted = [*doubts]
     document = {"outputs": [str(place) for place in places], "made": len(ended) - len(failed)}
     document |= {"left": existing, "failed": failed, "trusted": not doubted, "doubted": doubted}
     document["catalogues"] = [outcome.content for outcome in ended if not outcome.failure]
-    verdict = (
-        f"{len(doubted)} of {len(places)} tables are NOT to be trusted: {some(doubted, 6)}" if doubted else ""
-    )
     told = [outcome.text for outcome in ended if outcome.text] or [f"{output}: nothing was left to do"]
-    text = "\n".join(filter(None, (verdict, *told)))
+    reasons = [Doubt(Quality.CATALOGUE, f"{name}: {text}") for name, text in doubts.items()]
+    subject = f"{len(doubted)} of {len(places)} tables" if doubted else str(output)
+    verdict = Verdict(against=tuple(reasons), subject=subject, stars="table by table, below")
+    document |= verdict.answers()
+    text = "\n".join((verdict.display().text(), *told))
     about = list(dict.fromkeys(warnings))
     return Outcome(places, document, text, warnings=about, failure="; ".join(failed), trusted=not doubted)
 
 
-def _is_doubted(place: Path) -> bool:
-    """True if a table that was made earlier says that it is not to be trusted; formats without a header say nothing."""
+def _doubt_of(place: Path) -> str:
+    """The doubt that a table that was made earlier states of itself; empty for formats without a header."""
     from walop_jax.data.user_tables import read_input_table
 
-    return read_input_table(place).table.meta.get("TRUSTED", True) in (False, "F", "False")
+    meta = read_input_table(place).table.meta
+    doubted = meta.get("TRUSTED", True) in (False, "F", "False")
+    return str(meta.get("DOUBT", "it says that it is not to be trusted")) if doubted else ""
 
 
 def _applied(call: tuple[bool, dict[str, Any]]) -> Outcome[None]:

@@ -371,6 +371,7 @@ class Command(Generic[T]):
             job = dataclasses.replace(job, elements=elements)
         output, names = arguments.get("output"), self.writes
         self._check_apart(arguments)
+        body = self._body_of(arguments)
         if output is not None and isinstance(names, str):
             check_output(output, overwrite=job.overwrite)
             if names == "table":
@@ -378,10 +379,19 @@ class Command(Generic[T]):
 
                 table_format(output)
         if output is None or not names or isinstance(names, str):
-            return self.body(job, **arguments)
+            return body(job, **arguments)
         with output_folder(output, names, overwrite=job.overwrite) as folder:
-            outcome = self.body(dataclasses.replace(job, folder=folder), **arguments)
+            outcome = body(dataclasses.replace(job, folder=folder), **arguments)
             return outcome.save(folder) if outcome.files or outcome.saved_as else outcome
+
+    def _body_of(self, arguments: dict[str, Any]) -> Callable[..., Outcome[T]]:
+        """The body; the arguments up to those of any number (`*inputs`) are given by position, and taken out."""
+        own = [*self.signature.parameters.values()]
+        many = next((n for n, p in enumerate(own) if p.kind is inspect.Parameter.VAR_POSITIONAL), None)
+        if many is None:
+            return self.body
+        *first, rest = [arguments.pop(p.name) for p in own[: many + 1]]
+        return lambda job, **others: self.body(job, *first, *(rest or ()), **others)
 
     def _check_apart(self, arguments: Mapping[str, Any]) -> None:
         """Refuse, as `UsageError`, outputs that are inputs, and two outputs in one file."""

@@ -49,7 +49,7 @@ def compare(
     A quadratic per grid point, a transmission model per camera, 100 stars with p up to 5 %, corrections Δq and
     Δu; on the grid points and between them. The reference is the joint model, or the truth that comes with a
     simulated set. RUN/comparison.json has the statistics, comparison.fits every point, four figures the rest: also
-    the spectral appendix and the full-Moon scheme. (Two calibrations are compared by epoch.)
+    the spectral appendix and the full-Moon scheme. (Two calibrations are compared by check.)
 
     In Python: a `Comparison`; `calibration` is the joint fit (default: made here), `truth` a file, or (x, y, matrices)
     in memory, in degrees. Raises `DataError`, ahead of the joint fit, for a set with too few polariser angles for

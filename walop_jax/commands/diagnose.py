@@ -98,15 +98,19 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.summary import summary
     from walop_jax.diagnosis.figure_data import figure_data, write_figure_data
-    from walop_jax.diagnosis.findings import document
+    from walop_jax.diagnosis.findings import document, of_diagnosis
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.model_file import render
-    from walop_jax.science.field_accuracy import accuracy_of_fit
+    from walop_jax.science.field_accuracy import accuracy_of_fit, verdict_of_fit
 
     product, after = found.calibration(), found.after
     complete = found.complete
     usable, shown = after.trusted and complete, found.display()
-    if (accuracy := accuracy_of_fit(after)) is not None:
+    accuracy, verdict = accuracy_of_fit(after), None
+    if after.verdict is not None:
+        fit = verdict_of_fit(after, accuracy, complete=complete)
+        verdict = of_diagnosis(fit, found.unexplained, found.subject, complete=complete)
+    if accuracy is not None:
         shown = dataclasses.replace(shown, facts=(*shown.facts, *accuracy.facts(complete=complete)))
 
     def write_summary(path: Path) -> None:
@@ -119,8 +123,9 @@ def outcome_of(job: Job, found: Diagnosis, output: PathLike | None) -> Outcome[D
     return Outcome(
         found,
         document(found),
-        display=shown,
-        below=f"The calibration can{'' if usable else 'not'} be trusted; written to {output}.",
+        extra={} if verdict is None else verdict.answers(),
+        display=shown if verdict is None else verdict.on_top_of(shown),
+        below="" if output is None else f"Written to {output}.",
         files={
             SUMMARY: write_summary,
             PRODUCT: lambda path: write_calibration(path, product),

@@ -162,14 +162,22 @@ def save(
 
 
 def shown_with_accuracy(result: FitResult, accuracy: FieldAccuracy | None) -> Display:
-    """What is shown of a fit, headed by how well stars are known with it."""
+    """What is shown of a fit, headed by the verdict on it for stars, and by how well these are known with it."""
+    from walop_jax.science.field_accuracy import verdict_of_fit
+
     shown = result.display()
-    if accuracy is None:
+    if result.verdict is None:
         return shown
+    verdict = verdict_of_fit(result, accuracy)
+    if accuracy is None:
+        return verdict.on_top_of(shown)
     # The accuracy names the mistakes that could hide with their effect on stars.
     hidden = "" if result.hidden is None else result.hidden.in_words()
     notes = tuple(note for note in shown.notes if note != hidden)
-    return dataclasses.replace(shown, facts=(*accuracy.facts(), *shown.facts), notes=notes)
+    shown = dataclasses.replace(
+        shown.without(["p of a star"]), facts=(*accuracy.facts(), *shown.facts), notes=notes
+    )
+    return verdict.on_top_of(shown)
 
 
 def accuracy_document(accuracy: FieldAccuracy | None) -> dict[str, object] | None:

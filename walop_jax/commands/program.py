@@ -29,8 +29,8 @@ UNTRUSTED = 3  # exit code of a command that has written a result which is not t
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 not done, or a check that does not hold, with one line on stderr; 2 wrong usage; 3 done, "
-    "but the result is not to be trusted; 130 interrupted."
+    "Exit codes: 0 done; 1 not done, with one line on stderr; 2 wrong usage; 3 done, but no go: "
+    "the result is not to be used; 130 interrupted."
 )
 PRINTED = "prints its result and takes no output: keep it with > FILE, with --json for programs"
 KEYWORD_ONLY = inspect.Parameter.KEYWORD_ONLY
@@ -126,13 +126,18 @@ def _parameter(name: str, option: Option, default: Any, hidden: bool = False) ->
     return inspect.Parameter(name, KEYWORD_ONLY, default=given, annotation=Annotated[kind, note])
 
 
+def _default(parameter: inspect.Parameter) -> Any:
+    """The default of a parameter; None for arguments of any number, of which there may be none."""
+    return None if parameter.kind is inspect.Parameter.VAR_POSITIONAL else parameter.default
+
+
 def _command(name: str) -> Any:
     """A command as typer makes it, of a function whose signature is made of the options."""
     word = name.replace("-", "_")
     command: Command[Any] = command_of(getattr(importlib.import_module(f"walop_jax.commands.{word}"), word))
     options = command.described
     parameters = [
-        _parameter(key, options[key], p.default, hidden=key == "seed" and not command.random)
+        _parameter(key, options[key], _default(p), hidden=key == "seed" and not command.random)
         for key, p in command.signature.parameters.items()
         if key in options
     ]

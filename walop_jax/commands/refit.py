@@ -82,8 +82,10 @@ def refit(
     is not to be trusted (it does not explain the data, a parameter lies far from its prior, the residuals hold patterns
     or differ between parts of the data) is written with TRUSTED = F and warnings, exit code 3.
 
-    The first lines give the error of p of a star, whether it is good enough for --goal, and what to do if
-    not; the calibration may make half of the goal.
+    The first line is the verdict for stars: go, go with reservations, or no go, with the first reason and its remedy,
+    as walop-jax check RUN has it; then the error of p of a star, and all other reasons. The calibration may make half
+    of --goal. A calibration that is to be trusted, but is no go (something that acts on stars is not measured, or p is
+    not known well enough), ends with exit code 0 here, as the fit has done what it was asked, and with 3 in check.
 
     --clip leaves single intensities out that lie so many standard errors from the fit of all others (cosmic rays, stars
     in a patch of sky; 5 is usual), and lists them in RUN/clipped.ecsv. The set is fitted anew until nothing lies off
@@ -92,7 +94,7 @@ def refit(
 
     Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
     the residuals of the smooth model. --compress makes of them a set of some hundred field points, a megabyte: refit,
-    diagnose, limits, epoch and sample read it like any other set and answer in seconds as from all pixels, near the
+    diagnose, limits, check and sample read it like any other set and answer in seconds as from all pixels, near the
     values that were fitted, with a warning when these have moved too far. Structure smaller than a twentieth of the
     field is not in it.
 
@@ -114,7 +116,7 @@ def refit(
     from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
     from walop_jax.fit.refit import with_honest_errors
-    from walop_jax.science.field_accuracy import accuracy_of_fit
+    from walop_jax.science.field_accuracy import accuracy_of_fit, verdict_of_fit
 
     wanted = goal_of(goal) or GOAL
     if compress is not None:
@@ -135,12 +137,12 @@ def refit(
     mapped = output is not None and result.likelihood.layout.large and result.converged
     residuals = residual_map(result) if mapped else None
     misfit = describe(result) if output is not None and not result.explains_data else None
-    shown = shown_with_accuracy(result, accuracy)
+    verdict, shown = verdict_of_fit(result, accuracy), shown_with_accuracy(result, accuracy)
     # Warnings are printed apart.
     shown = dataclasses.replace(shown, notes=tuple(n for n in shown.notes if n not in result.warnings))
     rows, cameras = result.clipped, result.model.template.cameras.names
     brief = dataclasses.replace(shown, rows=(), notes=()).text()
-    judged = f"The calibration can{'' if result.trusted else 'not'} be trusted; written to {output}."
+    written = "" if output is None else f"Written to {output}."
     options = {"instrument": instrument, "effects": effects, "elements": job.elements}
     outcome = Outcome(
         result,
@@ -151,10 +153,10 @@ def refit(
             misfit=misfit,
             residuals=residuals,
         ),
-        extra={"seed": job.seed},
+        extra={"seed": job.seed, **verdict.answers()},
         display=shown,
-        text=None if result.trusted else f"{brief}\n{judged}",
-        below=judged,
+        text=None if result.trusted else f"{brief}\n{written}",
+        below=written,
         files={
             PRODUCT: lambda path: write_calibration(path, Calibration.from_fit(result, residuals)),
             CLIPPED: None if rows is None else lambda path: rows.write(path, calset, cameras),

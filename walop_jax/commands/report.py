@@ -45,7 +45,7 @@ def report(
     verdict, the accuracy of p over the field, the data, the findings, residuals before and after, maps
     of the matrix and of its errors, pulls from the priors, all parameters, warnings, inputs and versions, as far as RUN
     holds them; the page names missing files. Results of sample and limits in RUN are there as well; compare,
-    epoch, limits, plan, stack, watch and certify have pages of their own. A page that exists is made anew; another file
+    check, limits, plan and stack have pages of their own. A page that exists is made anew; another file
     of that name is left alone unless --overwrite is given.
 
     In Python: a `Page`; of a fit or a diagnosis in memory, which needs an `output`.

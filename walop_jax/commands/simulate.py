@@ -99,10 +99,10 @@ def simulate(
     exposures are those of a plan file (see walop-jax docs files): field points, angles, Moon patches, standards,
     filters.
 
-    Nights of one instrument, to rehearse epoch, stack and watch on: --like TRUTH.json --night 10. Each night has
-    noise and weather of its own, also with the same seed.
+    Nights of one instrument, to rehearse check and stack on: --like TRUTH.json --night 10. Each night has noise and
+    weather of its own, also with the same seed.
 
-    With `stars` it is a catalogue of the sky for `apply` and `watch` (RA, DEC, BP_RP and all): the same plan, seed and
+    With `stars` it is a catalogue of the sky for `apply` and `check` (RA, DEC, BP_RP and all): the same plan, seed and
     effects give the stars of the instrument that the set calibrates. With `cameras` there are those of the cameras as
     well, beside it, for `gather`.
 

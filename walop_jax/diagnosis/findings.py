@@ -17,6 +17,7 @@ from walop_jax.diagnosis.class_product import Classes, Shape
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import per_cent, plain, probability, some, value_and_error
@@ -297,6 +298,11 @@ class Diagnosis(Drawn):
         """True if nothing is left that the model found does not explain."""
         return self.verdict in ("consistent", "effect_found")
 
+    @property
+    def subject(self) -> str:
+        """What its first line is about."""
+        return f"Diagnosis ({self.verdict.replace('_', ' ')})"
+
     def why(self, name: str) -> str:
         """Reasons for which an effect, a description or a change of the instrument was not named, with numbers.
 
@@ -366,9 +372,8 @@ class Diagnosis(Drawn):
         names = [step.in_words for step in self.steps]
         if self.unexplained is not None:
             names.append(self.unexplained.number or "something without a name")
-        verdict = "not examined" if self.after.verdict is None else self.after.verdict.words
-        return Display(
-            title=f"Diagnosis: {self.verdict.replace('_', ' ')}; fit {verdict}",
+        shown = Display(
+            title=f"{self.subject}: not examined",
             facts=(
                 ("found", ", ".join(names) or "nothing beyond the starting model"),
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
@@ -379,6 +384,26 @@ class Diagnosis(Drawn):
             rows=tuple(rows),
             notes=tuple(sentences(document(self))),
         )
+        if self.after.verdict is None:
+            return shown
+        verdict = of_diagnosis(self.after.verdict, self.unexplained, self.subject, complete=self.complete)
+        return verdict.on_top_of(shown)
+
+
+def of_diagnosis(fit: Verdict, left: Unexplained | None, subject: str, *, complete: bool) -> Verdict:
+    """The verdict on a diagnosis, given that on its fit and what is left over."""
+    if complete:
+        return fit.with_doubts((), subject=subject)
+    what = "something without a name is missing from the model" if left is None else left.description
+    off, cure = (
+        None,
+        "walop-jax report shows where it is; describe its cause with --effects, and diagnose again",
+    )
+    if left is not None and left.number:
+        what, cure = f"{left.number} is wrong", "correct the number that the set states, and fit again"
+    elif left is not None and math.isfinite(left.change_of_qu):
+        off = left.change_of_qu
+    return fit.with_doubts([Doubt(Quality(0), what, off=off, remedy=cure)], subject=subject)
 
 
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:

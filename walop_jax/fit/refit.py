@@ -241,7 +241,6 @@ class FitResult(Fitted):
 
     def display(self) -> Display:
         """The verdict and the parameters."""
-        verdict = "not examined" if self.verdict is None else self.verdict.words
         facts = {
             "χ²/dof": f"{self.chi2:.1f} / {self.dof} = {self.chi2 / max(self.dof, 1):.4g}, from {self.n_data} "
             f"intensities, {len(self.model.free)} free parameters",
@@ -250,7 +249,14 @@ class FitResult(Fitted):
         }
         if self.clipped is not None:
             facts["outliers"] = str(self.clipped)
-        return self.shown(f"Fit of {self.model.name}: {verdict}", facts, (*self.notes, *self.warnings))
+        shown = self.shown(f"Fit of {self.model.name}: not examined", facts, (*self.notes, *self.warnings))
+        if self.verdict is None:
+            return shown
+        subject, known_by = (
+            f"Fit of {self.model.name}",
+            "walop.check(fit) works it out" if self.trusted else "",
+        )
+        return dataclasses.replace(self.verdict, subject=subject, stars=known_by).on_top_of(shown)
 
 
 def covariance(model: Model, expansion: Expansion) -> Matrix:

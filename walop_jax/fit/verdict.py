@@ -1,4 +1,8 @@
-"""The verdict on a fit: all doubts about it, computed once; bits, words, exit codes and trust are read off it."""
+"""The verdict on a fit, a calibration, or stars: go, go with reservations, or no go, and why.
+
+All doubts, each with what it does to q and u of stars and with one remedy. They are computed once; bits, words, first
+lines, exit codes and trust are read off them.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,14 @@ import dataclasses
 import enum
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.io.text import rounded, some
+from walop_jax.io.display import Display, Displayed
+from walop_jax.io.text import per_cent, rounded, some
 
 STATED = "N_ERR"
 """Origin of the errors of a fit that explains the data: the stated errors."""
@@ -65,16 +70,62 @@ class Quality(enum.IntFlag):
         return tuple(bit.meaning for bit in Quality if bit & self)
 
 
+REMEDIES: Mapping[Quality, str] = {
+    Quality.NOT_CONVERGED: "walop-jax inspect looks for faults of the data",
+    Quality.UNEXPLAINED: "walop-jax diagnose looks for missing effects",
+    Quality.DOUBTED: "walop-jax diagnose looks for the cause",
+    Quality.ERRORS_TOO_LARGE: "check the gain, and whether N_ERR holds variances or other units",
+    Quality.AT_PRIOR_EDGE: "walop-jax diagnose looks for what pulls at it",
+    Quality.CLASS_ONLY: "walop-jax plan RUN --criterion apart gives the exposures that separate the class",
+    Quality.FREE_FORM: "walop-jax report RUN shows the pattern; describe its cause in an --effects file",
+    Quality.ILL_CONDITIONED: "walop-jax plan names the exposures that separate the parameters",
+}
+"""What to do about a doubt that brings no remedy of its own, by its bit."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Doubt:
-    """A doubt about a fit: a bit of `Quality`, a sentence for the user, and whether it forbids trust.
+    """A doubt: a bit of `Quality`, a sentence for the user, whether it forbids trust, its effect and its remedy.
 
-    A remark has no bit and forbids nothing.
+    One that forbids nothing is a reservation; without a bit it is a remark. `off` is by how much it makes q or u of
+    stars wrong, or uncertain, as a fraction (None: not known).
     """
 
     bit: Quality
     sentence: str
     blocking: bool = True
+    off: float | None = None
+    remedy: str = ""
+
+    @property
+    def what(self) -> str:
+        """The sentence, or the meanings of its bits where it has none."""
+        return self.sentence or "; ".join(self.bit.meanings) or "it was not trusted when it was written"
+
+    @property
+    def cure(self) -> str:
+        """The one remedy: its own, or that of its bit."""
+        if self.remedy:
+            return self.remedy
+        return next((remedy for bit, remedy in REMEDIES.items() if bit & self.bit), "")
+
+    @property
+    def words(self) -> str:
+        """Sentence, effect on stars and remedy, each said once."""
+        number = "" if self.off is None else per_cent(self.off)
+        size = f" (q, u off by {number} %)" if number and f"{number} %" not in self.what else ""
+        told = not self.cure or self.cure in self.what or ("walop-jax " in self.what and not self.remedy)
+        return f"{self.what}{size}" if told else f"{self.what}{size}; {self.cure}"
+
+    def document(self) -> dict[str, Any]:
+        """As plain data, an entry of `reasons`."""
+        return {"what": self.what, "off": self.off, "remedy": self.cure, "blocking": self.blocking}
+
+    @property
+    def _rank(self) -> tuple[bool, float]:
+        """Before others: what forbids trust, then what does most to stars; what may do anything is the largest."""
+        unknown = np.inf if self.blocking else 0.0
+        return not self.blocking, -(unknown if self.off is None else self.off)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,42 +200,100 @@ class Hidden:
         return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """Statistics of a fit and all doubts about it.
+GO, RESERVED, NO_GO = "go", "go, with reservations", "no go"
+"""The three answers."""
 
-    The one rule of trust: a result is trusted if none of the doubts `against` it is blocking. `noise_scale` multiplied
-    the errors of the data in the fit (1: as given); `structure` is what field points differ by; `covariance_from` names
-    the origin of the covariance ("fit" or "posterior"), `errors_from` what that was made from: the stated errors of the
-    data, or the residuals (`fit.robust`).
+
+class VerdictPart(NamedTuple):
+    """What one question found behind a verdict: the result, its document, and how it is shown."""
+
+    value: Any
+    document: Mapping[str, Any]
+    shown: Display
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Verdict(Displayed):
+    """The verdict on `subject`: all doubts about it, and statistics where it is a fit.
+
+    The one rule of trust: a result is trusted, and a go, if none of the doubts `against` it is blocking. `stars` says
+    how well p of a star is known with it. `parts` are the results that the doubts were read off, by name.
+
+    Of a fit: `noise_scale` multiplied the errors of the data (1: as given); `structure` is what field points differ by;
+    `covariance_from` names the origin of the covariance ("fit" or "posterior"), `errors_from` what that was made from:
+    the stated errors of the data, or the residuals (`fit.robust`).
     """
 
-    chi2: float
-    dof: int
-    n_data: int
-    noise_scale: float
-    converged: bool
+    chi2: float = float("nan")
+    dof: int = 0
+    n_data: int = 0
+    noise_scale: float = 1.0
+    converged: bool = True
     against: tuple[Doubt, ...] = ()
     covariance_from: str = "fit"
     errors_from: str = STATED
     structure: Structure = NO_STRUCTURE
+    subject: str = dataclasses.field(default="", compare=False)
+    stars: str = dataclasses.field(default="", compare=False)
+    parts: Mapping[str, VerdictPart] = dataclasses.field(default_factory=dict, compare=False)
 
     @classmethod
     def recorded(cls, *, trusted: bool, quality: int, warnings: Sequence[str] = (), **others: Any) -> Verdict:
-        """The verdict that a file states; it does not relate sentences to bits."""
-        remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in warnings)
-        bits = (Doubt(Quality(quality), "", blocking=not trusted),) if quality or not trusted else ()
-        return cls(**others, against=(*bits, *remarks))
+        """The verdict that a file states, which relates no sentence to a bit: all bits are those of the first one.
+
+        Of a fit that is not trusted that is the first reason against it.
+        """
+        said = [*warnings]
+        bits = Quality(quality)
+        first = (Doubt(bits, said.pop(0) if said and not trusted else "", blocking=not trusted),)
+        remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in said)
+        return cls(**others, against=(*(first if quality or not trusted else ()), *remarks))
+
+    def with_doubts(
+        self,
+        doubts: Iterable[Doubt],
+        *,
+        subject: str = "",
+        stars: str = "",
+        parts: Mapping[str, VerdictPart] | None = None,
+    ) -> Verdict:
+        """The verdict with more against it, each sentence once."""
+        against, said = [*self.against], {doubt.sentence for doubt in self.against}
+        for doubt in doubts:
+            if doubt.sentence not in said or not doubt.sentence:
+                against.append(doubt)
+            said.add(doubt.sentence)
+        return dataclasses.replace(
+            self, against=tuple(against), subject=subject or self.subject, stars=stars or self.stars,
+            parts={**self.parts, **(parts or {})},
+        )  # fmt: skip
+
+    def __getitem__(self, name: str) -> Any:
+        """The result of one of its `parts`."""
+        if name not in self.parts:
+            raise KeyError(f"{name!r} was not asked; there are {', '.join(self.parts) or 'no parts'}")
+        return self.parts[name].value
 
     @property
     def trusted(self) -> bool:
-        """True if no doubt about the fit forbids its use."""
+        """True if no doubt forbids the use."""
         return not any(doubt.blocking for doubt in self.against)
+
+    @property
+    def go(self) -> bool:
+        """The same, as the answer to the question whether it can be used for stars."""
+        return self.trusted
 
     @property
     def quality(self) -> Quality:
         """The bits of all doubts."""
         return functools.reduce(operator.or_, (doubt.bit for doubt in self.against), Quality(0))
+
+    @property
+    def reasons(self) -> tuple[Doubt, ...]:
+        """All doubts that say something, the one that does most to q and u of stars first."""
+        told = [doubt for doubt in self.against if doubt.blocking or doubt.sentence]
+        return tuple(sorted(told, key=lambda doubt: doubt._rank))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -197,6 +306,58 @@ class Verdict:
         return tuple(d.sentence for d in self.against if d.bit & Quality.DOUBTED and d.sentence)
 
     @property
+    def objections(self) -> tuple[str, ...]:
+        """The sentences that forbid the use, the first reason first."""
+        return tuple(doubt.what for doubt in self.reasons if doubt.blocking)
+
+    @property
+    def reservations(self) -> tuple[str, ...]:
+        """The sentences that forbid nothing, the first reason first."""
+        return tuple(doubt.what for doubt in self.reasons if not doubt.blocking)
+
+    @property
     def words(self) -> str:
-        """The verdict as it is printed everywhere."""
-        return "trusted" if self.trusted else "not trusted"
+        """The answer: go, go with reservations, or no go."""
+        if not self.trusted:
+            return NO_GO
+        return RESERVED if self.reasons else GO
+
+    @property
+    def first_line(self) -> str:
+        """Subject, answer, and the first reason with its remedy: the title of everything that shows a verdict."""
+        return ": ".join(filter(None, (self.subject, self.words, *(d.words for d in self.reasons[:1]))))
+
+    @property
+    def first_facts(self) -> tuple[tuple[str, str], ...]:
+        """The lines below: what it means for p of a star, and all further reasons."""
+        others = [f"{doubt.words}" for doubt in self.reasons[1:]] or ["nothing else"]
+        unknown = "not known" if self.trusted else "not known: it is not to be used"
+        return ("p of a star", self.stars or unknown), *zip(
+            ["also", *[""] * (len(others) - 1)], others, strict=True
+        )
+
+    def on_top_of(self, shown: Display) -> Display:
+        """A display with the first lines of the verdict as its own; sentences that these hold are not said again."""
+        shown = shown.without([name for name, _ in self.first_facts if name])
+        told = {doubt.sentence for doubt in self.reasons}
+        notes = tuple(note for note in shown.notes if note not in told)
+        facts = (*self.first_facts, *shown.facts)
+        return dataclasses.replace(shown, title=self.first_line, facts=facts, notes=notes)
+
+    def answers(self) -> dict[str, Any]:
+        """The keys that every document with a verdict has."""
+        return {
+            "go": self.go, "answer": self.words, "p_of_a_star": self.stars or None,
+            "reasons": [doubt.document() for doubt in self.reasons],
+        }  # fmt: skip
+
+    def document(self) -> dict[str, Any]:
+        """The answer, and the documents of its parts by their names."""
+        parts = {name: {**part.document, "shown": part.shown.document()} for name, part in self.parts.items()}
+        return self.answers() | {"warnings": list(self.warnings)} | parts
+
+    def display(self) -> Display:
+        """The first lines, with the numbers and tables behind them."""
+        shown = [part.shown for part in self.parts.values()]
+        first = shown[0] if len(shown) == 1 else Display("")
+        return self.on_top_of(first)

@@ -8,7 +8,7 @@ import html
 import importlib
 import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, ClassVar
 
 from walop_jax.io.code import blank
@@ -65,6 +65,15 @@ class Display:
             tuple(tuple(map(str, row)) for row in document["rows"]),
             tuple(map(str, document["notes"])),
         )
+
+    def without(self, gone: Collection[str]) -> Display:
+        """The same without the facts of these names; lines without a name go with the one above."""
+        facts, dropped = [], False
+        for name, text in self.facts:
+            dropped = name in gone if name else dropped
+            if not dropped:
+                facts.append((name, text))
+        return dataclasses.replace(self, facts=tuple(facts))
 
     def shortened(self, most: int) -> Display:
         """The same in at most `most` lines: rows of the table go, and it is said how many."""

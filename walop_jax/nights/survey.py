@@ -119,7 +119,14 @@ class Survey(Drawn):
             against.append(Doubt(Quality.DOUBTED, what))
         structure = NO_STRUCTURE if self.like is None else self.like.verdict.structure
         n_data = sum(night.n_data for night in nights)
-        return Verdict(chi2, dof, n_data, 1.0, True, tuple(against), structure=structure)
+        stars = ""
+        if self._matrix is not None:
+            error = per_cent(self.error_of_p(self.last))
+            stars = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
+        return Verdict(
+            chi2, dof, n_data, 1.0, True, tuple(against), structure=structure,
+            subject=f"Survey of {nights[0].instrument}", stars=stars,
+        )  # fmt: skip
 
     @property
     def trusted(self) -> bool:
@@ -345,7 +352,8 @@ class Survey(Drawn):
         value, covariance = self.values_at(self.last)
         error = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
         return {
-            "trusted": verdict.trusted, "quality": int(verdict.quality), "chi2": verdict.chi2, "dof": verdict.dof,
+            **verdict.answers(), "trusted": verdict.trusted, "quality": int(verdict.quality), "chi2": verdict.chi2,
+            "dof": verdict.dof,
             "n_data": verdict.n_data, "nights": len({night.number for night in self.data.nights}),
             "first": self._first, "last": self.last,
             "valid_from": start, "valid_until": stop, "validity": self.validity,
@@ -392,16 +400,12 @@ class Survey(Drawn):
             "nights": f"{len({night.number for night in nights})}, MJD {start + HALF_A_DAY:.2f} to {self.last:.2f}",
             "valid": f"from MJD {start:.2f} until {stop:.2f}",
         }
-        if self._matrix is not None:
-            error = per_cent(self.error_of_p(self.last))
-            facts["p of a star"] = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
         if not self.breaks:
             facts["changes"] = "none found beyond the laws"
         rows = []
         for case in self.breaks:
             size, alike = " ± ".join(value_and_error(case.size, case.error)), ", ".join(case.alike[:3])
             rows.append((case.kind, case.name, size, case.unit, str(case.night), f"{case.z:+.1f}", alike))
-        title = f"Survey of {nights[0].instrument}: {verdict.words}"
         head = ("change", "of", ">size", "unit", ">first night", ">z", "or as well")
         notes = tuple(dict.fromkeys((*verdict.warnings, *self.advice)))
-        return Display(title, tuple(facts.items()), head, tuple(rows), notes)
+        return verdict.on_top_of(Display("", tuple(facts.items()), head, tuple(rows), notes))

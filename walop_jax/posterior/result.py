@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import STATED
+from walop_jax.fit.verdict import STATED, Doubt, Quality, Verdict
 from walop_jax.io.code import versions_of
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
@@ -303,6 +303,20 @@ class PosteriorSample(Drawn):
         return self.convergence.converged and (self.accuracy is None or self.accuracy.exact_enough)
 
     @property
+    def verdict(self) -> Verdict:
+        """The verdict: it is no go where the chains, or the fit that they are around, are not to be trusted."""
+        again = "walop-jax sample RUN --resume goes on, or take fewer coefficients"
+        of_fit = "walop-jax diagnose looks for what the fit lacks"
+        bad = [] if self.trusted else self.warnings
+        doubts = [
+            Doubt(Quality(0), text, remedy=again if self.of_trusted_fit or number else of_fit)
+            for number, text in enumerate(bad)
+        ]
+        remarks = (Doubt(Quality(0), text, blocking=False) for text in self.warnings if self.trusted)
+        stars = "that of the fit, with this covariance: walop-jax check RUN" if self.trusted else ""
+        return Verdict(against=(*doubts, *remarks), subject="Posterior", stars=stars)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about everything that does not hold."""
         sentences = [] if self.convergence.converged else [self.convergence.message(self.seconds_per_step)]
@@ -471,13 +485,14 @@ class PosteriorSample(Drawn):
             median = value_and_error(float(row["MEDIAN"]), half)
             ess = f"{float(row['ESS']):.0f}"
             rows.append((str(row["NAME"]), *median, str(row["UNIT"]), f"{low} … {high}", ess))
-        return Display(
-            title=f"Posterior: {'trusted' if self.trusted else 'not converged, or not exact enough'}",
+        shown = Display(
+            title="",
             facts=(("sampler", self.sampler), ("chains", self.convergence.message())),
             head=("coefficient", ">median", ">error", "unit", ">95 %", ">effective samples"),
             rows=tuple(rows),
             notes=(self.comparison, *self.warnings),
         )
+        return self.verdict.on_top_of(shown)
 
     def document(self) -> dict[str, Any]:
         """The content of `sample.json`, as plain data."""
@@ -493,6 +508,7 @@ class PosteriorSample(Drawn):
             "sampler": self.sampler,
             "errors_from": self.errors_from,
             "trusted": self.trusted,
+            **self.verdict.answers(),
             "converged": v.converged,
             "message": v.message(self.seconds_per_step),
             "warnings": list(self.warnings),

@@ -20,10 +20,18 @@ import jinja2
 from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.product import read_calibration
 from walop_jax.data.user_tables import read_input_table
-from walop_jax.fit.verdict import Quality
+from walop_jax.fit.verdict import GO, Quality
 from walop_jax.io.display import Display, Displayed, signed
 from walop_jax.io.errors import fail
-from walop_jax.io.names import COMMISSIONING, DOCUMENTS, LIMITS, SUMMARY, TRACKS
+from walop_jax.io.names import (
+    CHECK,
+    DOCUMENTS,
+    LIMITS,
+    QUALITY_FIGURE,
+    SUMMARY,
+    TRACKS,
+    WATCH_FIGURE,
+)
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import probability, rounded, value_and_error, with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS
@@ -35,13 +43,21 @@ from walop_jax.reports.run import FigureSource, RunContents, noted, read_limits
 from walop_jax.reports.style import PAGE, TEMPLATES, WIDTHS, Canvas, texts
 from walop_jax.reports.wording import data_in_words, effect_in_words, names_in_words, symbols_in_words
 from walop_jax.science.commissioning import Certificate, requirements
-from walop_jax.science.field_accuracy import FieldAccuracy
+from walop_jax.science.field_accuracy import FieldAccuracy, for_stars
 
 GENERATOR = '<meta name="generator" content="walop-jax'  # of every page
 MOST_PULLS = 8
 SHOWN_CANDIDATES = 10
 _NAMED = 3  # patterns in a sentence
 MANY = 32  # rows of a table above which it is folded
+PARTS = {
+    "commissioning": "The calibration by itself",
+    "epoch": "After new calibration exposures",
+    "watch": "For these stars",
+    "affected": "What changes",
+    "quality": "Quality of the night",
+}
+"""Sections of the page of a check by the names of its parts, where there are several."""
 SMALL = ("ladder", "protection")  # figures that take half of the width
 
 
@@ -164,8 +180,8 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
     requirements_shown, go = _asked(run)
     answered = any(name.startswith("good for") for name, _ in head.facts)
     if trusted and requirements_shown is not None and (goal is not None or not answered):
-        accuracy = _accuracy(run)
-        head = head if accuracy is None else _with_goal(head, accuracy)
+        accuracy, complete = _accuracy(run), diagnosis is None or good
+        head = head if accuracy is None else _with_goal(head, run, accuracy, complete=complete)
     error_maps = _accuracy_pictures(run) if trusted else ()
     limits = []
     if run.limits is not None:
@@ -210,17 +226,18 @@ def render(run: RunContents, goal: float | None = None) -> tuple[str, tuple[str,
 
 
 def _asked(run: RunContents) -> tuple[Display | None, bool]:
-    """Go or no-go with its reasons: as `certify` has left it, or worked out; and whether it is a go."""
-    if run.commissioning is not None and run.source.goal == GOAL:
-        shown = display_of(run.commissioning, run.source.folder / COMMISSIONING)
-        return shown, bool(run.commissioning["go"])
+    """Go or no-go with its reasons: as `check` has left it, or worked out; and whether it is a go."""
+    if run.checked is not None and run.source.goal == GOAL:
+        shown = display_of(run.checked["commissioning"], run.source.folder / CHECK)
+        answer = str(run.checked.get("answer", GO)).capitalize()
+        return dataclasses.replace(shown, title=answer), bool(run.checked["go"])
     accuracy = _accuracy(run)
     if run.calibration is None or accuracy is None:
         return None, True
     checks = requirements(run.calibration.verdict, "", accuracy, None)
+    verdict = for_stars(run.calibration.verdict, accuracy)
     judged = Certificate(run.source.folder, (), checks)
-    title = "Go, with reservations" if judged.missing else "Go: fit for use"
-    return dataclasses.replace(judged.display(), title=title if judged.go else "No go"), judged.go
+    return dataclasses.replace(judged.display(), title=verdict.words.capitalize()), verdict.go
 
 
 def _accuracy(run: RunContents) -> FieldAccuracy | None:
@@ -231,12 +248,17 @@ def _accuracy(run: RunContents) -> FieldAccuracy | None:
         return None
 
 
-def _with_goal(head: Display, accuracy: FieldAccuracy) -> Display:
+def _with_goal(head: Display, run: RunContents, accuracy: FieldAccuracy, *, complete: bool) -> Display:
     """The head of a page with the answer for another goal in place of that of the fit."""
-    answer = accuracy.facts()
-    names, answers = {name for name, _ in answer}, ("good for", "what to do")
-    unchanged = (fact for fact in head.facts if fact[0] not in names and not fact[0].startswith(answers))
-    return dataclasses.replace(head, facts=(*answer, *unchanged))
+    answer = accuracy.facts(complete=complete)
+    answers = {name for name, _ in (*answer, *head.facts) if name.startswith("good for")}
+    head = head.without({"also", *answers, *(name for name, _ in answer)})
+    shown = dataclasses.replace(head, facts=(*answer, *head.facts))
+    if run.calibration is None or not complete:
+        return shown
+    subject = head.title.partition(": ")[0]
+    verdict = dataclasses.replace(for_stars(run.calibration.verdict, accuracy), subject=subject)
+    return verdict.on_top_of(shown)
 
 
 def _accuracy_pictures(run: RunContents) -> list[Picture]:
@@ -435,17 +457,22 @@ def render_other(folder: Path, kind: str) -> tuple[str, tuple[str, ...]]:
     pictures = _pictures(folder, kind, document, missing)
     limited = kind == "plan" and (folder / LIMITS).exists()
     limits = read_limits(folder / LIMITS).display() if limited else None
-    good = bool(document.get(page.get("trust"), True)) and bool(document.get("new_trusted", True))
+    good = bool(document.get(page.get("trust"), True))
+    parts = {name: title for name, title in PARTS.items() if kind == "check" and name in document}
     sections = (
         Section("figures", "Figures", pictures=pictures),
         Section("numbers", "In numbers", dataclasses.replace(head, facts=())),
+        *(
+            Section(name, title, display_of(document[name], folder / CHECK))
+            for name, title in (parts.items() if len(parts) > 1 else ())
+        ),
         Section("limits", "Limits of the plan", limits),
     )
     text = filled(
         head,
         sections,
         good=good,
-        untrusted=not document.get("trusted", document.get("new_trusted", True)),
+        untrusted=not document.get("trusted", True),
         title=page["title"],
         doubts=[warning for warning in document.get("warnings", ()) if warning not in head.notes],
         name=folder.resolve().name,
@@ -466,8 +493,10 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
         worst = read_limits(folder / LIMITS).worst
         names = ["separation"] if worst is None else ["protection", "separation"]
         return drawn(FigureSource(Run(folder)), names, missing)
-    if kind == "epoch":
-        return _change_of_the_matrix(folder, document, missing)
+    if kind == "check":
+        pictures = _change_of_the_matrix(folder, document.get("epoch", {}), missing)
+        drawn_there = (("watch", WATCH_FIGURE), ("quality", QUALITY_FIGURE))
+        return [*pictures, *_saved(folder, [file for part, file in drawn_there if part in document], missing)]
     if kind == "survey":
         pictures = []
         with noted(missing, "Parameters against time are not drawn: {}."):
@@ -477,11 +506,19 @@ def _pictures(folder: Path, kind: str, document: Mapping[str, Any], missing: lis
                 pictures.append(picture("tracks", draw_tracks))
         return [*pictures, picture("nights", functools.partial(survey_figures.nights_figure, document))]
     pattern = rf"{kind}.*\.png"
-    names = {name: words for name, words in texts("captions").items() if re.fullmatch(pattern, name)}
+    return _saved(folder, [name for name in texts("captions") if re.fullmatch(pattern, name)], missing)
+
+
+def _saved(folder: Path, names: Sequence[str], missing: list[str]) -> list[Picture]:
+    """Pictures that a command has left in the folder, with their captions; those that are not there are `missing`."""
     missing += [f"{name} is not there." for name in names if not (folder / name).exists()]
-    return [  # panels of watch are below each other: whole on a narrow screen
-        Picture(embedded((folder / name).read_bytes()), words, small=kind == "watch")
-        for name, words in names.items()
+    return [  # panels below each other are whole on a narrow screen
+        Picture(
+            embedded((folder / name).read_bytes()),
+            texts("captions")[name],
+            small=name in (WATCH_FIGURE, QUALITY_FIGURE),
+        )
+        for name in names
         if (folder / name).exists()
     ]
 

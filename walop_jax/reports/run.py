@@ -184,8 +184,8 @@ class RunContents:
     """The contents of a run; None for files that are not there. `missing` names their sections of a page.
 
     `source` is what figures are drawn from. `summary`, `diagnosis` and `sample` are the contents of the JSON files;
-    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `commissioning` is a go or no-go
-    and its reasons.
+    `corner` are the bytes of a PNG; `limits` are detection limits of the same data, `checked` is the answer of
+    `walop-jax check` to whether this calibration is good, of the same content.
     """
 
     source: FigureSource
@@ -196,7 +196,7 @@ class RunContents:
     sample: dict[str, Any] | None
     corner: bytes | None
     limits: DetectionLimits | None
-    commissioning: dict[str, Any] | None
+    checked: dict[str, Any] | None
     missing: list[str]
 
 
@@ -248,7 +248,7 @@ def read_run(run: Run | Path) -> RunContents:
         if stated is not None and abs(stated - ratio) > SAME_CHI2 * ratio:
             what = f"is of another fit than {names.SUMMARY}: this folder was written to again since"
             missing.append(f"{names.DIAGNOSIS} {what}.")
-    sampled, corner, judged = names.POSTERIOR in run, names.CORNER, names.COMMISSIONING
+    sampled, corner = names.POSTERIOR in run, names.CORNER
     contents = RunContents(
         source=source,
         summary=summary,
@@ -260,9 +260,7 @@ def read_run(run: Run | Path) -> RunContents:
         ),
         corner=optional(corner, (run.folder / corner).read_bytes, "no corner plot", sampled),
         limits=optional(names.LIMITS, lambda: _limits(run, summary), "no protection level", False),
-        commissioning=optional(
-            judged, lambda: run.document(judged, ("go", "requirements")), "no go or no-go", False
-        ),
+        checked=optional(names.CHECK, lambda: _checked(run, calibration), "no go or no-go", False),
         missing=missing,
     )
     if calibration is not None and diagnosis is None:
@@ -279,6 +277,13 @@ def read_limits(path: Path) -> DetectionLimits:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         what = f"is not what walop-jax limits writes: {error}"
         raise fail(what, file=path, advice="run it again") from error
+
+
+def _checked(run: Run, calibration: Calibration | None) -> dict[str, Any] | None:
+    """The answer about the calibration of a run by itself; None for one about other questions, or another content."""
+    document = run.document(names.CHECK, ("go",))
+    same = calibration is not None and document.get("product") == calibration.content_hash()
+    return document if same and "commissioning" in document else None
 
 
 def _limits(run: Run, summary: dict[str, Any]) -> DetectionLimits:

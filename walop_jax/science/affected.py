@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.verdict import Quality
+from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.io.display import Display, Displayed
-from walop_jax.io.text import beside, some, two_digits
+from walop_jax.io.text import beside, per_cent, some, two_digits, with_minus_sign
 from walop_jax.science.apply import Stars, results_of
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.sky.nights import night_of
 
+ASKED = "ask the catalogues that the old calibration has made, by that calibration"
 LIMIT = 0.5  # standard errors; a result that is off by a quarter of its variance is made again
 MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
 
@@ -65,6 +66,29 @@ class Affected(Displayed):
     def again(self) -> tuple[str, ...]:
         """The catalogues that must be made again, each once."""
         return tuple(dict.fromkeys(night.catalogue for night in self.nights if night.again))
+
+    @property
+    def against(self) -> tuple[Doubt, ...]:
+        """A reason for every catalogue that must be made again: what the new calibration does to its stars."""
+        doubts = []
+        for name in self.again:
+            nights = [night for night in self.nights if night.catalogue == name and night.again]
+            worst = max(nights, key=lambda night: (night.most, night.lost + night.gained))
+            off = max(float(np.hypot(night.q, night.u)) for night in nights)
+            q, u = (with_minus_sign(f"{100 * mean:+.2g}") for mean in (worst.q, worst.u))
+            shift = f"q by {q} %, u by {u} % in the mean, {two_digits(worst.most)} standard errors in 95 % of the stars"
+            what = f"{name} changes ({self._reason(worst).removeprefix('again: ')}): {shift}"
+            doubts.append(
+                Doubt(Quality.CATALOGUE, what, off=off, remedy=f"make it again: walop-jax apply NEW {name}")
+            )
+        remarks = (Doubt(Quality(0), text, blocking=False, remedy=ASKED) for text in self.warnings)
+        return (*doubts, *remarks)
+
+    @property
+    def stars_in_words(self) -> str:
+        """The largest mean change of q and u of a night, in words."""
+        largest = max((float(np.hypot(night.q, night.u)) for night in self.nights), default=0.0)
+        return f"q, u change by {per_cent(largest)} % at most in the mean of a night"
 
     def _reason(self, night: NightShift) -> str:
         """Why a night must be made again, in a few words; empty where it need not."""

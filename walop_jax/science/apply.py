@@ -511,7 +511,7 @@ def check_validity(calibration: Calibration, settings: Settings) -> None:
     """Raise `DataError`, with column and rows, for settings that the exposures of a calibration do not cover.
 
     Settings are filter and temperature. Dates are no bound: every science exposure lies outside those of the
-    calibration; later exposures say whether it still holds (`epoch`, `watch`).
+    calibration; later exposures say whether it still holds (`check`).
     """
     beyond = calibration.beyond_settings(settings)
     if not beyond.any():

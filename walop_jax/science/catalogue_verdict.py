@@ -2,69 +2,79 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.verdict import Quality
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.science.apply import Stars
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.overlaps import Overlap
 
 MOST = 0.5
 """Share of the stars from which bits of FLAG are about the catalogue, not about single stars."""
-OF_STARS = (
-    Quality.NO_STOKES,
-    Quality.BEYOND_FIELD,
-    Quality.BEYOND_SETTINGS,
-    Quality.VALIDITY_FORCED,
-    Quality.DISAGREES,
-    Quality.PLACE,
-    Quality.REPEATED,
-)
-"""Bits of FLAG of which most stars should have none."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CatalogueVerdict:
-    """Why the results of a catalogue are not to be trusted (`doubts`), and what concerns some of its stars only."""
-
-    doubts: tuple[str, ...] = ()
-    reservations: tuple[str, ...] = ()
-
-    @property
-    def trusted(self) -> bool:
-        """True if nothing is doubted."""
-        return not self.doubts
-
-    @property
-    def words(self) -> str:
-        """The verdict as it is printed first."""
-        if self.doubts:
-            return f"NOT to be trusted: {self.doubts[0]}"
-        return f"trusted, but {self.reservations[0]}" if self.reservations else "trusted"
+OF_STARS = {
+    Quality.NO_STOKES: "give rows at several settings of the plate, and counts above 0 in all cameras",
+    Quality.BEYOND_FIELD: "check X and Y (degrees), and the pointing; or calibrate more of the field",
+    Quality.BEYOND_SETTINGS: "give the calibration of this filter and temperature",
+    Quality.VALIDITY_FORCED: "give the calibration of this filter and temperature, without --force",
+    Quality.DISAGREES: "check the background, the order of the cameras and the unit of N",
+    Quality.PLACE: "look for dust, a ghost or a bright neighbour at that place",
+    Quality.REPEATED: "leave out the rows that are there twice",
+}
+"""Bits of FLAG of which most stars should have none, with a remedy."""
+CORRECT = "correct the catalogue, and apply the calibration again"
+DATE_IT = "walop-jax check RUN STARS... dates it; new calibration exposures measure it"
 
 
 def verdict_on(
     calibration: Calibration, rows: Catalogue, stars: Stars, seen_twice: Overlap | None = None
-) -> CatalogueVerdict:
+) -> Verdict:
     """The verdict on the stars of a catalogue, reduced with a calibration."""
-    check, doubts = stars.check, []
+    return Verdict().with_doubts(_against(calibration, rows, stars, seen_twice))
+
+
+def _against(
+    calibration: Calibration, rows: Catalogue, stars: Stars, seen_twice: Overlap | None
+) -> Iterator[Doubt]:
+    check, of_fit = stars.check, calibration.verdict
     places = tuple(f"{place.words()} (FLAG {Quality.PLACE:d})" for place in check.places)
     said = [f"{text} (FLAG {Quality.CATALOGUE:d})" for text in check.warnings()]
-    of_check = [text for text in said if not any(place.words() in text for place in check.places)]
+    remedy = CORRECT if check.misread else DATE_IT
+    of_check = [
+        Doubt(Quality.CATALOGUE, text, remedy=remedy)
+        for text in said
+        if not any(place.words() in text for place in check.places)
+    ]
     if check.misread:
-        doubts += of_check
-    doubts += rows.doubts
-    if not calibration.verdict.trusted:
-        doubts += [text.replace("this calibration is", "the calibration is") for text in calibration.warnings]
+        yield from of_check
+    yield from (Doubt(Quality.CATALOGUE, text, remedy=CORRECT) for text in rows.doubts)
+    if not of_fit.trusted:
+        (why,) = calibration.warnings
+        text = why.replace("this calibration is", "the calibration is")
+        yield Doubt(of_fit.quality, text, remedy=of_fit.reasons[0].cure)
     if not check.misread:
-        doubts += of_check
+        yield from of_check
     if seen_twice is not None:
-        doubts += seen_twice.warnings()
-    for bit in OF_STARS:
+        yield from (
+            Doubt(
+                Quality.CATALOGUE,
+                text,
+                off=seen_twice.excess,
+                remedy="walop-jax diagnose looks for the cause",
+            )
+            for text in seen_twice.warnings()
+        )
+    for bit, cure in OF_STARS.items():
         share = float(np.mean(stars.flag & bit > 0)) if len(stars.flag) else 0.0
-        if share > MOST and not calibration.verdict.quality & bit:
-            doubts.append(f"FLAG {bit:d} of {100 * share:.0f} % of the stars: {bit.meaning}")
-    return CatalogueVerdict(tuple(dict.fromkeys(doubts)), () if check.misread else places)
+        if share > MOST and not of_fit.quality & bit:
+            yield Doubt(bit, f"FLAG {bit:d} of {100 * share:.0f} % of the stars: {bit.meaning}", remedy=cure)
+    if not check.misread:
+        for text in places:
+            yield Doubt(Quality.PLACE, text, blocking=False, remedy=OF_STARS[Quality.PLACE])
+    if of_fit.trusted:
+        for text in calibration.warnings:
+            yield Doubt(
+                Quality(0), text, blocking=False, remedy="Q_HIDDEN and U_HIDDEN of every star have its size"
+            )

@@ -10,7 +10,7 @@ from walop_jax.calibration.certify import Check
 from walop_jax.calibration.product import PRODVERS, Validity
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import CalibrationSet
-from walop_jax.fit.verdict import Verdict
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Displayed
 from walop_jax.science.field_accuracy import FieldAccuracy, Requirement
 
@@ -38,9 +38,27 @@ def requirements(
     return tuple(checks)
 
 
+REMADE = "make the calibration again from its sets: walop-jax refit"
+SAID_BY_THE_FIT = ("converged", "explains the data")
+"""Checks whose failure the verdict on the fit says as well, with its reason."""
+MEASURED = "measured"  # the check that the accuracy for stars says as well, with its remedy
+CURES = {
+    "conditioned": "take the exposures that separate the parameters: walop-jax plan",
+    "validity": "state MJD in EXPOSURES, and the curves of all filters in FILTERS",
+    "parents": "fit sets from files, whose hashes are recorded: walop-jax refit",
+    "model": "give the --effects and --elements with which it was made",
+    "physics": "walop-jax inspect looks for counts that no camera can have",
+    MEASURED: "observe an unpolarised and a polarised standard, or the moonlit sky",
+}
+"""Remedies of checks that do not hold; of all others `REMADE`."""
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate(Displayed):
-    """Checks of a product, requirements for stars, validity, hash (`content`), SHA-256 of its inputs (`parents`)."""
+    """Checks of a product, requirements for stars, validity, hash (`content`), SHA-256 of its inputs (`parents`).
+
+    `verdict` is that for stars, as its fit has it; `facts` are the accuracy of p, its limits, and what could hide.
+    """
 
     path: Path
     checks: tuple[Check, ...]
@@ -48,6 +66,8 @@ class Certificate(Displayed):
     validity: Validity | None = None
     content: str = ""
     parents: tuple[str, ...] = ()
+    verdict: Verdict = dataclasses.field(default_factory=Verdict)
+    facts: tuple[tuple[str, str], ...] = ()
 
     @property
     def failed(self) -> tuple[Check, ...]:
@@ -60,17 +80,33 @@ class Certificate(Displayed):
         return not self.failed and all(need.met for need in self.requirements if need.needed)
 
     @property
+    def unmet(self) -> tuple[Requirement, ...]:
+        """The requirements that are not met, the needed ones first."""
+        return tuple(sorted((n for n in self.requirements if not n.met), key=lambda need: not need.needed))
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """Advice on requirements that are not met, the needed ones first."""
-        missing = sorted((n for n in self.requirements if not n.met), key=lambda need: not need.needed)
-        return tuple(n.found if n.advice in n.found else f"{n.found}: {n.advice}" for n in missing)
+        return tuple(n.found if n.advice in n.found else f"{n.found}: {n.advice}" for n in self.unmet)
+
+    @property
+    def against(self) -> tuple[Doubt, ...]:
+        """The reasons that it holds: those of the verdict, and the failed checks that say more."""
+        said = () if self.verdict.trusted else SAID_BY_THE_FIT
+        said += (MEASURED,) if any(doubt.off for doubt in self.verdict.against) else ()
+        failed = (check for check in self.failed if check.name not in said)
+        checks = (
+            Doubt(Quality(0), f"{check.name}: {check.found}", remedy=CURES.get(check.name, REMADE))
+            for check in failed
+        )
+        return (*self.verdict.against, *checks)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {
             "product": str(self.path),
             "go": self.go,
-            "requirements": [dataclasses.asdict(requirement) for requirement in self.requirements],
+            "requirements": [_plain(requirement) for requirement in self.requirements],
             "valid": not self.failed,
             "schema": PRODVERS,
             "content": self.content,
@@ -80,9 +116,15 @@ class Certificate(Displayed):
         }
 
     def display(self) -> Display:
-        """Go or no-go, a line for each check and requirement (NO: it is needed), and advice on those not met."""
+        """A line for each check and requirement (NO: it is needed), with the accuracy of p and what could hide."""
         rows = [("ok" if check.passed else "FAILED", check.name, check.found) for check in self.checks]
         for need in self.requirements:
             rows.append(("ok" if need.met else "NO" if need.needed else "advice", need.what, need.found))
-        title = f"{self.path}: {'go' if self.go else 'NO GO'}"
-        return Display(title, head=("", "requirement", "result"), rows=tuple(rows), notes=self.missing)
+        title = f"{self.path}: {'go' if self.go else 'no go'}"
+        said = {doubt.what for doubt in self.verdict.reasons}
+        notes = (text for need, text in zip(self.unmet, self.missing, strict=True) if need.found not in said)
+        return Display(title, self.facts, ("", "requirement", "result"), tuple(rows), tuple(notes))
+
+
+def _plain(need: Requirement) -> dict[str, Any]:
+    return {key: value for key, value in dataclasses.asdict(need).items() if key != "off"}

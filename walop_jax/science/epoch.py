@@ -40,7 +40,7 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS
 from walop_jax.fit.model_of_set import model_like
 from walop_jax.fit.refit import FitResult, fit, with_honest_errors
-from walop_jax.fit.verdict import NO_STRUCTURE
+from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import probability, two_digits, value_and_error, with_minus_sign
@@ -57,6 +57,12 @@ Matrix = Float[np.ndarray, "k k"]
 
 CHANCE = 0.01
 COPIES = 1e-12  # chance of so small a χ² from which two sets are taken for one
+SAME_DATA = "these are the data from which the old calibration was made"
+TOO_ALIKE = "the two data sets agree too well to be independent"
+UNEXPLAINED = (
+    "walop-jax diagnose NEW.fits looks for what is missing; until then reduce no stars of that night"
+)
+STACK = "walop-jax stack RUN NEW.fits -o SURVEY dates the change and gives one calibration for all nights"
 _SHOWN = 8  # parameters
 SURE = 5.0  # standard errors
 _KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
@@ -91,6 +97,17 @@ class LargestChange:
     alone: bool
     asked: int
     p_value: float
+
+    @property
+    def words(self) -> str:
+        """The change, its significance and how it was corrected, in words."""
+        size = " ± ".join(value_and_error(self.size, max(self.error, 1e-12)))
+        significance = with_minus_sign(f"{self.z:+.1f}")
+        alone = " if no other parameter has changed" if self.alone else ""
+        return (
+            f"{self.name} by {size} {self.unit}".rstrip() + f", {significance} standard errors{alone} (p "
+            f"{probability(self.p_value)} after allowing for {self.asked} trials)"
+        )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -137,6 +154,33 @@ class Epoch(Displayed):
             return "The new data are not explained"
         return "The old calibration still fits" if self.fits else "The instrument has changed"
 
+    @property
+    def against(self) -> tuple[Doubt, ...]:
+        """The reasons against using the old calibration on, each with its effect on stars and its remedy."""
+        doubts = []
+        if self.fits is None:
+            what = "the model of the calibration, which explained its own data, does not explain the new ones"
+            doubts.append(Doubt(Quality.UNEXPLAINED, what, remedy=UNEXPLAINED))
+        elif not self.fits and self.largest is not None and self.star_errors is not None:
+            off = max(self.star_errors[name]["median"] for name in "qu") / 100.0
+            what = f"the instrument has changed: {self.largest.words}"
+            doubts.append(Doubt(Quality.DOUBTED, what, off=off, remedy=STACK))
+        if self.fits is not None and not self.new_trusted:
+            why = f": {self.warnings[0]}" if self.warnings else ""
+            doubts.append(Doubt(Quality.DOUBTED, f"the fit of the new data is not trusted{why}"))
+        copies = (text for text in self.warnings if text.startswith((SAME_DATA, TOO_ALIKE)))
+        other = "give a calibration set of another night"
+        return (*doubts, *(Doubt(Quality(0), text, blocking=False, remedy=other) for text in copies))
+
+    @property
+    def stars_in_words(self) -> str:
+        """What becomes of p of stars if the old calibration is used on, in words; empty where that is not known."""
+        if self.star_errors is None or self.same:
+            return ""
+        errors = self.star_errors["p"]
+        most = two_digits(errors["max"])
+        return f"off by {two_digits(errors['median'])} % (median; {most} % at most) if the new data are right"
+
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         return {"verdict": self.verdict} | dataclasses.asdict(self)
@@ -163,12 +207,8 @@ class Epoch(Displayed):
             old, new = (value_and_error(value, error)[0] for value in (entry.old, entry.new))
             rows.append((entry.name, old, new, with_minus_sign(f"{entry.z:+.1f}"), entry.unit))
         errors = self.star_errors["p"]
-        size = " ± ".join(value_and_error(largest.size, max(largest.error, 1e-12)))
         facts = {
-            "largest change": f"{largest.name} by {size} {largest.unit}".rstrip()
-            + f", {with_minus_sign(f'{largest.z:+.1f}')} standard errors"
-            + (" if no other parameter has changed" if largest.alone else "")
-            + f" (p {probability(largest.p_value)} after allowing for {largest.asked} trials)",
+            "largest change": largest.words,
             "bias of stars": f"{two_digits(errors['median'])} % of p with the old calibration (median), "
             f"{two_digits(errors['max'])} % at most",
             "chance": f"p {probability(self.p_value)} (χ² = {self.test:.1f} in {self.directions} directions, and "
@@ -239,11 +279,9 @@ def epoch(old: Calibration, result: FitResult) -> Epoch:
     p_value = _of_several(min(float(special.chdtrc(directions, chi2)), largest.p_value), 2)
     of_all = np.zeros_like(new.covariance)
     of_all[np.ix_(b, b)] = covariance
-    doubts = ["these are the data from which the old calibration was made: nothing can have moved"] * same
+    doubts = [f"{SAME_DATA}: nothing can have moved"] * same
     if not same and special.chdtr(directions, chi2) < COPIES:
-        what = (
-            f"the two data sets agree too well to be independent (χ² = {chi2:.2g} in {directions} directions)"
-        )
+        what = f"{TOO_ALIKE} (χ² = {chi2:.2g} in {directions} directions)"
         doubts = [f"{what}: is one a copy of the other?"]
     return Epoch(
         fits=p_value > CHANCE,

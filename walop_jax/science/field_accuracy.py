@@ -9,6 +9,7 @@ exactly, covariance C becomes C − C_G C_GG⁻¹ C_Gᵀ.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,12 +29,15 @@ from walop_jax.calibration.accuracy import (
 )
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, off_by, unmeasured
+from walop_jax.data.inspection import Finding, inspect
 from walop_jax.fit.refit import FitResult
+from walop_jax.fit.verdict import NOT_MEASURED, Doubt, Quality, Verdict
 from walop_jax.io.text import beside, per_cent, two_digits
 from walop_jax.likelihood.inverses import whitening
 
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
+NEXT_HIDDEN = 2  # mistakes that could hide, told beside the worst
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -55,7 +59,8 @@ class FieldAccuracy:
     `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
     mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
     median over the field (NaN: not computed), at its just undetected size, `hidden_worst` where it is largest; `remedy`
-    is the measurement that would show it. `not_measured` are the mistakes on which the data hold no information.
+    is the measurement that would show it; `next_hidden` are those that follow. `not_measured` are the mistakes on which
+    the data hold no information.
     `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
     where it does (None: everywhere). `goal` is what p of a star is wanted to: the calibration may make half of it.
     """
@@ -73,6 +78,7 @@ class FieldAccuracy:
     not_measured: tuple[CouldHide, ...] = ()
     with_u: Bool[np.ndarray, "y x"] | None = None
     goal: float = GOAL
+    next_hidden: tuple[CouldHide, ...] = ()
 
     @property
     def reached(self) -> float:
@@ -98,7 +104,7 @@ class FieldAccuracy:
         for name, gap in unmeasured(self.not_measured).items():
             size, _ = beside(100 * gap.error[0], 100 * allowed)
             found = f"{name} not measured, {off_by(*gap.error, shown=size)} at the usual size"
-            asked.append(Requirement(what, gap.error[0] <= allowed, found, gap.remedy))
+            asked.append(Requirement(what, gap.error[0] <= allowed, found, gap.remedy, off=gap.error[0]))
         light = two_digits((self.reached / allowed) ** 2)  # errors fall with its square root
         advice = f"{light} times the light; walop-jax plan RUN --goal {100 * allowed:.2g} gives the time that it takes"
         if self.without_u > 1.0 - SHARE and self.median <= allowed:
@@ -112,7 +118,9 @@ class FieldAccuracy:
             size, _ = beside(100 * self.hidden, 100 * self.goal)
             found = f"a systematic error of {size} % of q or u would go undetected"
             advice = self.remedy or "walop-jax limits lists the exposures that would show it"
-            asked.append(Requirement(what, self.hidden <= self.goal, found, advice, needed=False))
+            asked.append(
+                Requirement(what, self.hidden <= self.goal, found, advice, needed=False, off=self.hidden)
+            )
         return tuple(asked)
 
     @property
@@ -155,10 +163,10 @@ class FieldAccuracy:
         median_error += f"; below {goal} over {100 * self.share:.0f} % of the field"
         lines = [("p of a star", median_error if complete else f"{median_error}, if nothing were missing")]
         if complete:
-            verdict = [f"no: {lacks[0].found}", *(lack.found for lack in lacks[1:])] if lacks else []
-            verdict = verdict or [f"yes: {per_cent(self.reached)} % in {self.judged}"]
-            lines += zip([f"good for {goal}", *[""] * (len(verdict) - 1)], verdict, strict=True)
-            lines += [("what to do", lack.advice) for lack in lacks[:1] if lack.advice != self.remedy]
+            no = f"no, for {len(lacks)} reason{'s' if len(lacks) > 1 else ''} above"
+            lines.append(
+                (f"good for {goal}", no if lacks else f"yes: {per_cent(self.reached)} % in {self.judged}")
+            )
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
         if self.not_measured:
@@ -170,23 +178,42 @@ class FieldAccuracy:
             lines.append(("remedy", self.remedy))
         return tuple(lines)
 
+    @property
+    def further_facts(self) -> tuple[tuple[str, str], ...]:
+        """The mistakes that could hide beside the worst one, each with its effect on stars and what would show it."""
+        lines = (
+            f"{entry.in_words}: {off_by(*entry.error)}{f'; {entry.remedy}' if entry.remedy else ''}"
+            for entry in self.next_hidden
+        )
+        return tuple(("could hide as well" if number == 0 else "", line) for number, line in enumerate(lines))
+
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """A requirement on a calibration: whether it is met, the result, advice if not; `needed`: a reason against a go."""
+    """A requirement on a calibration: whether it is met, the result, advice if not; `needed`: a reason against a go.
+
+    `off` is by how much q or u of stars are wrong or uncertain where it is not met, as a fraction (None: not known).
+    """
 
     what: str
     met: bool
     found: str
     advice: str = ""
     needed: bool = True
+    off: float | None = None
+
+    @property
+    def doubt(self) -> Doubt:
+        """The reason that it is where it is not met."""
+        return Doubt(Quality(0), self.found, blocking=self.needed, off=self.off, remedy=self.advice)
 
 
 def _p_known(error: float, allowed: float, where: str, advice: str, *, needed: bool = True) -> Requirement:
     size, limit = beside(100 * error, 100 * allowed)
     found = f"{size} % in {where}, {limit} % allowed"
     # An error that is NaN is not known.
-    return Requirement(f"p known to {limit} % in {where}", error <= allowed, found, advice, needed)
+    off = error if np.isfinite(error) else None
+    return Requirement(f"p known to {limit} % in {where}", error <= allowed, found, advice, needed, off)
 
 
 def known_in_half(error: float, goal: float = GOAL, cause: str = "") -> Requirement:
@@ -208,6 +235,43 @@ def accuracy_of_fit(result: FitResult, goal: float = GOAL) -> FieldAccuracy | No
     None as well for an instrument that is not one of two arms (`field_accuracy`).
     """
     return field_accuracy(Calibration.from_fit(result), goal=goal) if result.converged else None
+
+
+def for_stars(
+    verdict: Verdict,
+    accuracy: FieldAccuracy | None,
+    findings: Iterable[Finding] = (),
+    *,
+    complete: bool = True,
+) -> Verdict:
+    """The verdict on a calibration for stars: that on its fit, with what it lacks for their accuracy.
+
+    `accuracy` is that of p over the field (None: not asked), `findings` are those of `inspect` about its data. The
+    accuracy of a fit that is not trusted, or not `complete`, is not known: it is no reason for anything. Notes are none
+    either.
+    """
+    doubts = [
+        Doubt(Quality(0), finding.what, blocking=finding.severity == "fault", remedy=finding.advice)
+        for finding in findings
+        if finding.severity != "note"
+    ]
+    if accuracy is None:
+        return verdict.with_doubts(doubts)
+    if verdict.trusted and complete:
+        needs = (accuracy.middle, *accuracy.requirements)
+        doubts = [*(need.doubt for need in needs if not need.met), *doubts]
+    if verdict.trusted and accuracy.not_measured:  # said with its size
+        said = NOT_MEASURED.partition("{")[0]
+        kept = tuple(doubt for doubt in verdict.against if not doubt.sentence.startswith(said))
+        verdict = dataclasses.replace(verdict, against=kept)
+    return verdict.with_doubts(doubts, stars=dict(accuracy.facts(complete=complete))["p of a star"])
+
+
+def verdict_of_fit(result: FitResult, accuracy: FieldAccuracy | None, *, complete: bool = True) -> Verdict:
+    """The verdict on a fit for stars, with what `inspect` finds in its data; `accuracy` is that of its calibration."""
+    of_fit = dataclasses.replace(result.checked_verdict(), subject=f"Fit of {result.model.name}")
+    findings = inspect(result.calset).findings if result.converged else ()
+    return for_stars(of_fit, accuracy, findings, complete=complete)
 
 
 def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOAL) -> FieldAccuracy | None:
@@ -236,6 +300,7 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
         without_u=float(np.mean(~with_u)),
         with_u=with_u,
         goal=goal,
+        next_hidden=mistakes[1 : 1 + NEXT_HIDDEN],
     )
 
 

@@ -12,6 +12,7 @@ Limits      C = W (nothing but the catalogue is known of a star): M is infinite,
 from __future__ import annotations
 
 import csv
+import dataclasses
 import functools
 import io
 import os
@@ -23,14 +24,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.accuracy import LARGEST_P
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.schema import Column
 from walop_jax.data.user_tables import numeric_column, read_input_table
+from walop_jax.fit.verdict import Doubt
+from walop_jax.fit.verdict import Quality as Bits
 from walop_jax.io.atomic import check_output
+from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.folder import locked
 from walop_jax.io.plain_tables import astropy_table, stacked, table_format, write_table
-from walop_jax.io.text import parse_toml, read_text
+from walop_jax.io.text import parse_toml, read_text, rounded, with_error
 from walop_jax.io.toml import Reader
 from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.sky.nights import night_of
@@ -45,6 +50,24 @@ OUTSIDE = "OUTSIDE"
 SAME = ("INSTRUME", "NIGHT", "FILTERS")
 """Columns that are alike in two rows of one night, of which the later one is kept."""
 Limits = Mapping[str, tuple[float, float]]
+SHOWN = {
+    "CHI2DOF": (1.0, ""), "ANGLE": (1.0, "deg"), "P_RATIO": (1.0, ""), "ZERO_Q": (100.0, "%"), "ZERO_U": (100.0, "%"),
+    "ACCURACY": (100.0, "%"),
+}  # fmt: skip
+"""Columns that are printed, with the factor and the unit in which they are."""
+CURES = {
+    "ANGLE": "check ROTATOR, and the angles of the standards in SOURCES",
+    "P_RATIO": "check p of the standards in SOURCES, and the sky that was subtracted",
+    "ZERO_Q": "observe unpolarised standards again; walop-jax diagnose looks for the polarisation of the telescope",
+    "ZERO_U": "observe unpolarised standards again; walop-jax diagnose looks for the polarisation of the telescope",
+    "STDCHI2": "look for a standard that is variable or mistaken: walop-jax diagnose",
+    "CHI2DOF": "walop-jax diagnose looks for missing effects",
+    "ACCURACY": "walop-jax plan RUN gives the exposures that are missing",
+    "HIDDEN": "walop-jax check RUN names the exposures that would show it",
+    "TRUSTED": "walop-jax diagnose looks for what is missing",
+    GAIN: "look for dust, clouds or another gain: the other nights of the table have the usual gains",
+}
+"""Remedies of numbers outside their limits, by column."""
 
 
 @functools.cache
@@ -206,7 +229,7 @@ def read_nights(path: Path) -> Any:
     table = source.table
     if lacking := [name for name in (*SAME, "CALHASH") if name not in table.colnames]:
         what = "the column is missing: this is no table of quality numbers"
-        advice = "name the table that walop-jax quality has made, or a new one"
+        advice = "name the table that walop-jax check --append has made, or a new one"
         raise fail(what, file=path, column=lacking[0], advice=advice)
     stated = [name for name in table.colnames if name in columns() or name.startswith(f"{GAIN}_")]
     about = {name: columns().get(name, OF_CAMERA) for name in stated}
@@ -271,6 +294,81 @@ def _medians_before(values: Float[np.ndarray, " n"], alike: Sequence[object]) ->
         if earlier := [values[k] for k in range(n) if alike[k] == kind and np.isfinite(values[k])]:
             medians[n] = np.median(earlier)
     return medians
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class QualityRow(Displayed):
+    """The row of a calibration (`mine`) in the `table` of nights, its limits, and remarks."""
+
+    table: Any
+    mine: Any
+    limits: Limits
+    output: str | None
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Names of the numbers outside their limits."""
+        return tuple(str(self.mine[OUTSIDE]).split())
+
+    @property
+    def night(self) -> str:
+        """The evening (MJD) in words."""
+        return f"night {self.mine['NIGHT']:.0f}" if np.isfinite(self.mine["NIGHT"]) else "this run"
+
+    def _printed(self, name: str) -> str:
+        factor, unit = SHOWN.get(name, (1.0, columns().get(name, ("", ""))[0]))
+        value = self.mine[name]
+        if name == "TRUSTED":
+            return "F"
+        if name not in ERRORS:
+            return f"{rounded(factor * float(value))} {unit}".rstrip()
+        return f"{with_error(factor * float(value), factor * float(self.mine[ERRORS[name]]))} {unit}".rstrip()
+
+    def _off(self, name: str) -> float | None:
+        """What a number does to q or u of a star with p = 5 %, as a fraction; None where that is not known."""
+        value = float(self.mine[name])
+        turned = 2.0 * LARGEST_P * np.deg2rad(value)
+        known = {"ANGLE": turned, "P_RATIO": LARGEST_P * (value - 1.0)}
+        known |= dict.fromkeys(("ZERO_Q", "ZERO_U", "ACCURACY", "HIDDEN"), value)
+        return abs(float(known[name])) if name in known and np.isfinite(value) else None
+
+    @property
+    def against(self) -> tuple[Doubt, ...]:
+        """A reason for every number outside its limits."""
+        doubts = []
+        for name in self.outside:
+            of_kind = GAIN if name.startswith(f"{GAIN}_") else name
+            low, high = self.limits.get(of_kind, (np.nan, np.nan))
+            factor, unit = SHOWN.get(name, (1.0, columns().get(name, ("", ""))[0]))
+            allowed = f", allowed {rounded(factor * low)} to {rounded(factor * high)} {unit}".rstrip()
+            of_which = " (of the median before)" if of_kind == GAIN else ""
+            what = f"{self.night}: {name} = {self._printed(name)}{allowed if np.isfinite(low + high) else ''}{of_which}"
+            off = None if name == "TRUSTED" else self._off(name)
+            doubts.append(Doubt(Bits.DOUBTED, what, off=off, remedy=CURES.get(of_kind, "")))
+        return tuple(doubts)
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data; `nights` are the rows of this calibration."""
+        return {
+            "output": self.output,
+            "nights": [{name: np.asarray(self.mine[name]).item() for name in self.table.colnames}],
+            "limits": {name: list(pair) for name, pair in self.limits.items()},
+            "outside": list(self.outside),
+            "remarks": list(self.remarks),
+        }
+
+    def display(self) -> Display:
+        """The row, in the table that it was added to."""
+        count = len(self.table)
+        title = f"{self.output or 'Quality numbers'}: {count} night{'s' if count != 1 else ''}"
+        head = (
+            "night (MJD)",
+            *(f">{name} ({unit})" if unit else f">{name}" for name, (_, unit) in SHOWN.items()),
+        )
+        values = (self._printed(name).removesuffix(f" {unit}") for name, (_, unit) in SHOWN.items())
+        row = (f"{self.mine['NIGHT']:.0f}", *values, str(self.mine[OUTSIDE]))
+        return Display(title, (), (*head, "outside"), (row,), self.remarks)
 
 
 def append(path: str | os.PathLike[str] | None, new: Any, limits: Limits) -> tuple[Any, list[str]]:

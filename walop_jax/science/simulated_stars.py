@@ -1,4 +1,4 @@
-"""A synthetic catalogue of stars that an instrument sees, with its truth: for trying `gather`, `apply` and `watch`."""
+"""A synthetic catalogue of stars that an instrument sees, with its truth: for trying `gather`, `apply` and `check`."""
 
 from __future__ import annotations
 

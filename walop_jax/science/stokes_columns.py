@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.fit.verdict import Quality
+from walop_jax.fit.verdict import Quality, Verdict
 from walop_jax.io.text import in_ascii
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.apply import Stars
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import CatalogueCheck
-from walop_jax.science.catalogue_verdict import CatalogueVerdict
 from walop_jax.science.colours import COOL, HOT
 from walop_jax.science.overlaps import extents
 from walop_jax.science.polarisation import polarisation
@@ -62,7 +61,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
 
 
 def header(
-    product: str, estimator: str, on_sky: float, check: CatalogueCheck, verdict: CatalogueVerdict
+    product: str, estimator: str, on_sky: float, check: CatalogueCheck, verdict: Verdict
 ) -> dict[str, Any]:
     """Cards of the output: the calibration (hash of its content), estimator, frame, colours, check and verdict."""
     frame = {0.0: "instrument", 1.0: "sky"}.get(on_sky, "sky where ROTATOR is given, else instrument")
@@ -75,7 +74,7 @@ def header(
         "TIMESYS": "UTC",
         "COLOURS": f"without TEFF: half the difference of {COOL:g} and {HOT:g} K",
         "TRUSTED": verdict.trusted,
-        **({"DOUBT": in_ascii(verdict.doubts[0])} if verdict.doubts else {}),
+        **({"DOUBT": in_ascii(verdict.objections[0])} if verdict.objections else {}),
         "HOLDS": check.holds,
         "CHI2DOF": round(check.noise, 6),
         "PHOTFAC1": round(float(factors[0]), 6),
@@ -120,11 +119,11 @@ def counted_flags(rows: Catalogue, instrument: Instrument) -> dict[Quality, str]
 
 
 def errors_in_words(columns: Mapping[str, tuple[Any, ...]]) -> str:
-    """The median error of p, and how much of it is noise of photons; empty where no star has one."""
+    """The median error of p, and how much of it is noise of photons."""
     error, q, u, *photons = (columns[name][0] for name in ("P_ERR", "Q_ERR", "U_ERR", "Q_PHOTON", "U_PHOTON"))
     measured = error > 0
     if not measured.any():
-        return ""
+        return "not known: no star has a result"
     share = sum(values[measured] ** 2 for values in photons) / (q[measured] ** 2 + u[measured] ** 2)
     typical, part = (100 * float(np.median(values)) for values in (error[measured], share))
-    return f"; error of p {typical:.2g} % (median), photons make {part:.0f} % of its variance"
+    return f"error {typical:.2g} % (median), photons make {part:.0f} % of its variance"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.fit.verdict import Doubt, Quality
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.text import some, two_digits, with_minus_sign
@@ -17,6 +18,10 @@ from walop_jax.sky.nights import FIRST_DATE
 
 SCATTERED = 4.0
 """χ² per degree of freedom from which stars in which no change is found do not say that a calibration holds."""
+_NOISE = "χ²/dof of the stars is"
+CALIBRATE = "take a calibration set and ask it: walop-jax check RUN NEW.fits"
+ERRORS = "correct N_ERR, or leave out stars that are blended, variable or saturated"
+TIMES = "give MJD in every row"
 _COURSES = {
     "step": "from {} on",
     "drift": "at the end, drifting since {}",
@@ -53,6 +58,15 @@ class WatchedChange(InstrumentChange):
         either = some([entry.words() for entry in (self.best, *self.rivals)], 5, " or ")
         return f"{when} {significance}, one of these, which the stars cannot separate: {either}"
 
+    @property
+    def off(self) -> float | None:
+        """By how much q or u of stars are wrong (a fraction), about; None where it is not one camera.
+
+        q = (N₀ − N₁)/(N₀ + N₁) of an arm, one camera of which is brighter by β, is wrong by (1 − q²) β/2.
+        """
+        best = self.best
+        return 0.5 * abs(best.size) if len(best.members) == 1 and best.kind != UNNAMED else None
+
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Watch(Displayed):
@@ -83,13 +97,33 @@ class Watch(Displayed):
         return bool(not self.changes and self.noise < SCATTERED)
 
     @property
+    def against(self) -> tuple[Doubt, ...]:
+        """The reasons against using the calibration on, each with its effect on stars and its remedy."""
+        doubts = [
+            Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE)
+            for change in self.changes
+        ]
+        noise = [text for text in self.warnings if text.startswith(_NOISE)]
+        unclear = not self.holds and not self.changes
+        told = [Doubt(Quality.CATALOGUE, text, blocking=unclear, remedy=ERRORS) for text in noise]
+        remarks = [Doubt(Quality(0), text, blocking=False, remedy=TIMES) for text in self.remarks]
+        return (*doubts, *told, *remarks)
+
+    @property
+    def stars_in_words(self) -> str:
+        """The smallest change of a camera that would have been seen, and what it does to stars, in words."""
+        step = 100.0 * float(np.min(self.smallest))
+        seen = f"a step of {two_digits(step)} % in one camera would be seen, q or u off by {two_digits(0.5 * step)} %"
+        return f"{seen} (99 %)"
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for every change, and one if the counts do not scatter by N_ERR."""
         texts = (*(change.words() for change in self.changes), *self.remarks)
         if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
             return texts
         factor = np.sqrt(self.noise)
-        return (*texts, f"χ²/dof of the stars is {self.noise:.3g}: N_ERR was multiplied by {factor:.3g}")
+        return (*texts, f"{_NOISE} {self.noise:.3g}: N_ERR was multiplied by {factor:.3g}")
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""

@@ -54,7 +54,7 @@ class Effect(Component):
     amplitudes, without effect at neutral, whatever the shape. `starts` are groups of initial shapes for a
     search: groups are alternatives, the members of a group are directions of a joint fit that `combine` turns
     into one effect. `one_sided` names amplitudes that physics keeps above neutral; `over_field` is true for an
-    effect visible only in several field points, `watched` for one that may change from night to night and that `watch`
+    effect visible only in several field points, `watched` for one that may change from night to night and that `check`
     looks for in stars; `reference` is its source; `said` are its changes (`change`),
     empty for an effect beyond them. `unlisted` says what its parameters are if there are too many of them to be listed
     in print; it is empty for an effect whose parameters are listed.

@@ -21,7 +21,7 @@ Parameters are the keys that hold a table:
 
 Keys of an entry: about, equation, note, source, revealed_by, separated_by; one_sided (parameters that physics keeps
 above neutral), over_field (true: visible only in several field points), watched (true: a change of the optics that
-`watch` looks for in stars), choices ({ camera = "cameras" },
+`check` looks for in stars), choices ({ camera = "cameras" },
 { source = "stars" }, or a list of words), arrangement (a change of `alternatives`; such an effect has no parameter),
 class (an effect of this package that is not linear in all its numbers), part (of the page of effects, which begins with
 this one).
