@@ -10,7 +10,6 @@ from one_arm import one_arm
 from small_run import SEED, SMALL
 
 import walop_jax as walop
-from walop_jax.data.records import Compression
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import TOLERANCE
 from walop_jax.fit.model_file import model_without_data
@@ -112,17 +111,6 @@ def test_a_tied_parameter_has_the_value_of_its_master_whatever_else_is_said(nort
     # The derivative is that of the map: finite differences, exact for what is linear.
     slopes = [model.full(free + step, anything) - values for step in np.eye(len(free))]
     np.testing.assert_allclose(np.transpose(slopes), model.selection(), atol=1e-15)
-
-
-def test_a_set_of_summed_pixels_starts_with_equal_plates(north):
-    """Summed half a µm from the design, of which the record holds the masters alone."""
-    model = north.model
-    there = {"half2.plate.mgf2": model.start[model.index("half2.plate.mgf2")] + 0.5}
-    record = Compression(pixels=1, chi2=1.0, dof=1, values=there, frames=())
-    calset = dataclasses.replace(north.calset, compression=record)
-    start = _start(Likelihood.of(calset, model))
-    assert all(start[i] == start[master] for i, master in ties(model))
-    assert start[model.index("chwp.mgf2")] == there["half2.plate.mgf2"]
 
 
 def test_a_search_ends_with_equal_plates_wherever_it_began(north):

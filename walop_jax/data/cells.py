@@ -6,7 +6,7 @@ Surface     Frames are cut into blocks. To the pixels of a block a surface is fi
             `ORDER` that is orthogonal over the pixels. Two things are special about these: values there have
             independent errors, σ/√(w n) each with w n the pixels that the point stands for, its cell; and the next
             polynomial, the largest of those left out, is zero there. A mean over a cell, taken for the value at its
-            middle, is off by side²/24 · ∇²; these values by the tenth power of the side of a block.
+            middle, is off by side²/24 · ∇²; these values by the eighth power of the side of a block.
 Light       Fitted are shares N_k/L of the light L = Σ_k N_k of a pixel, and N_k = share · (surface of L) at the points:
             what the cameras have in common, such as the illumination of the field, may be as rough as it likes. Of
             photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
@@ -40,10 +40,10 @@ from walop_jax.data.records import Block, FineStructure, Points
 from walop_jax.data.table_intensities import SPOILT, TableIntensities, usable
 from walop_jax.data.units import Place
 
-CELLS = 30
+CELLS = 40
 """Cells along the longer side of frames, unless the user says otherwise: with 4096² pixels of 10⁵ electrons parameters
 are off by less than 0.01 standard errors."""
-ORDER = 5
+ORDER = 4
 """Points along a side of a block."""
 MAP = 16
 """Parts of a block, along a side, in which structure is measured."""
@@ -53,7 +53,7 @@ _HUGE = 10.0  # times the median error in its block row: a mark of a bad pixel, 
 _BRIGHT = 20.0  # standard errors of the light of a pixel above which shares of it are taken
 _WHOLE = 0.2  # smallest eigenvalue of the normal matrix, 1 with all pixels, of a block with all of its points
 _SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a block hold
-_ALIKE = 0.5  # of the best exposure of a block: exposures that have less of it are left out there
+_ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it are left out there
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
 
 Vector = Float[np.ndarray, " n"]
@@ -86,10 +86,10 @@ class _Side:
         return zip(self.edges[:-1].tolist(), self.edges[1:].tolist(), strict=True)
 
     @staticmethod
-    def _scaled(first: int, last: int, pixel: Vector) -> Vector:
+    def _scaled(first: int, last: int, pixel: np.ndarray) -> Vector:
         return (2.0 * pixel - (first + last - 1)) / (last - first)
 
-    def polynomials(self, block: int, pixel: Vector) -> Float[np.ndarray, "n o"]:
+    def polynomials(self, block: int, pixel: np.ndarray) -> Float[np.ndarray, "n o"]:
         """The polynomials of a block at places along the side."""
         first, last = self.edges[block : block + 2].tolist()
         return (
@@ -216,7 +216,7 @@ class _Binning:
         rows = _Weights.of(self.along, [number])
         first, last = self.along.edges[number : number + 2].tolist()
         shape = (self.frames.cameras, last - first, self.frames.grid.width)
-        agreeing = [np.zeros(shape, np.float32) for _ in range(4)]
+        agreeing = [np.zeros(shape, np.float32) for _ in range(5)]
         sums = []
         for exposure in range(self.frames.exposures):
             counts, sigma, used = self._pixels(exposure, first, last)
@@ -353,9 +353,14 @@ class _Binning:
             parts = np.flatnonzero((fullest > 0) & (fullest >= _PART * fullest.max()))
             if not len(parts):
                 return (np.zeros(0),) * 5
-            total = count.sum(axis=0)[parts]
-            row, column = (entry[:, block].sum(axis=0)[parts] / total for entry in (sums.row, sums.column))
             terms, least = self._held(normal, len(parts))
+            total, rows, columns = (
+                entry.sum(axis=0) for entry in (count, sums.row[:, block], sums.column[:, block])
+            )
+            if len(terms) == 1:  # a constant, at the mean position of all pixels
+                total, rows, columns = (entry.sum(keepdims=True) for entry in (total, rows, columns))
+                count, parts = count.sum(axis=1, keepdims=True), np.zeros(1, int)
+            row, column = rows[parts] / total[parts], columns[parts] / total[parts]
         kept = least >= _ALIKE * least.max()
         self.tally.left_out += round(float(count[~kept].sum()))
         along, across = self.along.polynomials(number, row), self.across.polynomials(block, column)
@@ -366,8 +371,12 @@ class _Binning:
         share = np.einsum("pi,eij,ekj->pek", basis, inverse, sums.share[:, block][..., terms], optimize=True)
         light = np.einsum("pi,eij,ej->pe", basis, inverse, sums.light[:, block][:, terms], optimize=True)
         mean = sums.variance[:, block].sum(axis=-1) / np.maximum(count.sum(axis=-1), 1.0)[:, None]
-        part = sums.variance[:, block][..., parts] / np.maximum(count[:, parts], 1.0)[:, None]
-        variance = np.where(count[:, None, parts] > 0, part, mean[..., None]) * spread[:, None]
+        # More points than terms share the information of these.
+        spread = spread * (len(row) / len(terms))
+        here = count[:, None, parts]
+        of_parts = sums.variance[:, block] if len(terms) > 1 else mean[..., None] * here
+        part = of_parts[..., parts] / np.maximum(here, 1.0)
+        variance = np.where(here > 0, part, mean[..., None]) * spread[:, None]
         used = np.broadcast_to(kept, (len(row), len(kept))) & (light > 0)
         counts = np.where(used[..., None], share * light[..., None], 0.0)
         sigma = np.where(used[..., None], np.sqrt(np.moveaxis(variance, -1, 0)) * light[..., None], 1.0)
@@ -379,13 +388,13 @@ class _Binning:
         """Terms of the largest surface that the used parts of a block hold, and how well each exposure holds it."""
         size = self.along.order, self.across.order
         index = np.arange(size[0] * size[1]).reshape(size)
-        for order in range(max(size), 0, -1):
+        for order in range(max(size), 1, -1):
             terms = index[:order, :order].ravel()
             least = np.linalg.eigvalsh(normal[:, terms[:, None], terms])[:, 0]
-            # The first polynomial is constant: its term is the share of the pixels that are used.
-            if len(terms) == 1 or (len(terms) <= parts and least.max() >= _SOUND * normal[:, 0, 0].max()):
-                break
-        return terms, least
+            if len(terms) <= parts and least.max() >= _SOUND * normal[:, 0, 0].max():
+                return terms, least
+        # The first polynomial is constant: its term is the share of the pixels that are used.
+        return index[0, :1], normal[:, 0, 0]
 
     # --------------------------------------------------------------------------------------------------- structure
 
@@ -398,7 +407,7 @@ class _Binning:
         sums: _Sums,
         rows: _Weights,
     ) -> None:
-        """Add the residuals of an exposure about its surfaces, and what a gain would make: Σ r, Σ r², Σ q, Σ q²."""
+        """Add the residuals of an exposure about its surfaces and the effect of gains: Σ r, Σ r², Σ r⁴, Σ q, Σ q²."""
         size = rows.fit.shape[1], self.across.order
         regular = np.linalg.eigvalsh(sums.normal)[:, 0] >= _SOUND
         safe = np.where(regular[:, None, None], sums.normal, np.eye(size[0] * size[1]))
@@ -412,13 +421,14 @@ class _Binning:
             expected = surface * np.where(seen[some], light[some], 0.0)
             residual = np.where(seen[some], counts[:, some], 0.0) - expected
             response = expected * (1.0 - surface)
-            made = residual, residual * residual, response, response * response
+            square = residual * residual
+            made = residual, square, square * square, response, response * response
             for total, values in zip(agreeing, made, strict=True):
                 total[:, some] += values
 
     def _structure(self, number: int, agreeing: list[Float[np.ndarray, "k y x"]]) -> tuple[np.ndarray, ...]:
         """Position, mean square gain and its error of the parts of a row of blocks (`FineStructure`)."""
-        residual, square, response, power = agreeing
+        residual, square, fourth, response, power = agreeing
         first, last = self.along.edges[number : number + 2].tolist()
 
         def cut(edges: tuple[int, int]) -> np.ndarray:
@@ -433,10 +443,12 @@ class _Binning:
             sums = np.add.reduceat(along, columns[:-1], axis=2)
             return sums.reshape(len(values), -1).T
 
-        weight = summed(response**2 - power)
+        # The surfaces take up a little of what they are to show.
+        terms = self.along.order * self.across.order * len(self.across)
+        weight = summed(response**2 - power) * max(1.0 - terms / residual[0].size, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = summed(residual**2 - square) / weight
-            error = np.sqrt(2.0 * summed(square**2)) / weight
+            error = np.sqrt(2.0 * summed(square**2 - fourth)) / weight
         middle = [0.5 * (edges[:-1] + edges[1:] - 1) for edges in (columns, rows)]
         x, y = self.frames.grid.at(*(values.ravel() for values in np.meshgrid(*middle)))
         measured = (weight > 0).all(axis=1) & (error > 0).all(axis=1)

@@ -128,8 +128,8 @@ def find_minimum(
     sample = Likelihood.of(sample_set, likelihood.model, runner=likelihood.runner)
     sample = sample.with_errors_at(likelihood.errors_at)
     best = find_minimum(sample, first, noise_scale, worth)
-    how = {"tolerance": LARGE_TOLERANCE, "damping": 0.0}
-    found = _search(likelihood, "fit of all points", best.x, best.expansion.noise_scale, **how)
+    scale = best.expansion.noise_scale
+    found = _search(likelihood, "fit of all points", best.x, scale, tolerance=LARGE_TOLERANCE, damping=0.0)
     return dataclasses.replace(found, starts=best.starts)
 
 
