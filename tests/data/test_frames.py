@@ -116,12 +116,12 @@ def test_other_forms_of_the_same_frames(scene, tmp_path):
         n2 = hdus["N2"].data.copy()
         hdus.writeto(path)
     frames = read_calibration_set(path)
-    np.testing.assert_allclose(frames.points.x, GRID.points.x, atol=1e-15)
-    np.testing.assert_allclose(frames.points.y, GRID.points.y, atol=1e-15)
+    keep = np.arange(35) != 2 * 7 + 3  # a pixel that is used nowhere is no point
+    np.testing.assert_allclose(frames.points.x, GRID.points.x[keep], atol=1e-15)
+    np.testing.assert_allclose(frames.points.y, GRID.points.y[keep], atol=1e-15)
     block = frames.intensities.block(0, 35)
-    np.testing.assert_array_equal(block.used.all(axis=1), np.arange(35) != 2 * 7 + 3)
-    keep = np.arange(35) != 17
-    np.testing.assert_array_equal(block.counts[keep, :, 2], n2.reshape(7, 35).T[keep])
+    assert block.used.all()
+    np.testing.assert_array_equal(block.counts[:, :, 2], n2.reshape(7, 35).T[keep])
 
 
 def test_undefined_pixels_are_masked(scene, tmp_path):

@@ -12,7 +12,6 @@ from test_writing import columns as all_columns
 from test_writing import equal
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.grid import Grid
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import Block, Position

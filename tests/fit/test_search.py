@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from one_arm import one_arm
@@ -13,7 +11,6 @@ import walop_jax as walop
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.minimise import TOLERANCE
 from walop_jax.fit.model_file import model_without_data
-from walop_jax.fit.refit import _start
 from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed
 from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood, OpticsUsed

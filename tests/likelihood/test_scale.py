@@ -176,7 +176,8 @@ def test_whole_frames(tmp_path, side):
     known = result.sigma > 0
     pulls = (result.values - truth)[known] / result.sigma[known]
     print(
-        f"\n{side**2:,} pixels: read {read:.1f} s, fitted {fitted:.1f} s, {result.minimum.steps} steps; with the residual map {whole:.1f} s, peak {peak():.2f} GB; χ²/dof "
+        f"\n{side**2:,} pixels: read {read:.1f} s, fitted {fitted:.1f} s, {result.minimum.steps} steps; "
+        f"with the residual map {whole:.1f} s, peak {peak():.2f} GB; χ²/dof "
         f"{result.chi2 / result.dof:.5f}, {result.minimum.message}; residual map {residuals.significance():+.1f} "
         f"standard deviations above noise; pulls of the parameters: rms {np.sqrt(np.mean(pulls**2)):.2f}"
     )

@@ -192,6 +192,9 @@ class _Binning:
         )
         self.columns = _Weights.of(self.across, list(range(len(self.across))))
         self.tally, self.samples = _Tally(), []
+        self.single = (
+            len(self.along) * len(self.across) == grid.pixels
+        )  # each pixel is a cell, and stays as it is
 
     def result(self) -> tuple[Points, TableIntensities, FineStructure, list[str]]:
         """Go through all rows of blocks."""
@@ -222,7 +225,7 @@ class _Binning:
             counts, sigma, used = self._pixels(exposure, first, last)
             light = self._light(exposure, counts, sigma, used)
             sums.append(self._sums(counts, sigma, light, used, rows))
-            if not self.known[exposure]:
+            if not (self.known[exposure] or self.single):
                 self._add_residuals(agreeing, counts, light, used, sums[-1], rows)
         joined = _Sums(*(np.stack(arrays) for arrays in zip(*sums, strict=True)))
         points = [self._points(number, block, joined) for block in range(len(self.across))]
@@ -248,7 +251,7 @@ class _Binning:
             row, column = (int(entry[0]) for entry in np.nonzero(spoilt))
             tally.first_spoilt = tally.first_spoilt or f"plane {exposure}, row {first + row}, column {column}"
             tally.spoilt += count
-        if used.any() and len(self.along) * len(self.across) < self.frames.grid.pixels:
+        if used.any() and not self.single:
             sampled = used[:: 1 + len(used) // 64, ::8]
             for errors in sigma:
                 thinned = errors[:: 1 + len(used) // 64, ::8][sampled]
@@ -257,12 +260,11 @@ class _Binning:
                     tally.huge += int(huge.sum())
                     used = used & ~huge
         middle = (last - first) // 2
-        self.samples.append(
-            (counts[:, middle].T, sigma[:, middle].T, used[middle] & (not self.known[exposure]))
-        )
+        lit = used[middle] & (not self.known[exposure])
+        self.samples.append((counts[:, middle].T.copy(), sigma[:, middle].T.copy(), lit))
         if used.any():
-            lit = counts[:, used]
-            tally.lowest, tally.highest = min(tally.lowest, lit.min()), max(tally.highest, lit.max())
+            values = np.where(used, counts, counts[:, used][0, 0])
+            tally.lowest, tally.highest = min(tally.lowest, values.min()), max(tally.highest, values.max())
         return counts, sigma, used
 
     def _light(
@@ -273,7 +275,7 @@ class _Binning:
         used: Bool[np.ndarray, "y x"],
     ) -> Float[np.ndarray, "y x"]:
         """The light of every used pixel: the sum of its cameras, or 1 in blocks where shares of that say nothing."""
-        if self.known[exposure]:
+        if self.known[exposure] or self.single:
             return np.ones(used.shape)
         total = np.where(used, counts.sum(axis=0, dtype=float), 0.0)
         noise = np.where(used, np.einsum("kyx,kyx->yx", sigma, sigma), 0.0)
