@@ -15,7 +15,7 @@ from walop_jax.data.grid import Grid
 from walop_jax.data.records import Intensities
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import PointReader, thinned
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 
