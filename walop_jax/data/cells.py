@@ -1,4 +1,4 @@
-"""Whole frames become cells: some hundred field points that hold what all of their pixels say.
+"""Whole frames become cells: field points, usually 1600, that hold what all of their pixels say.
 
 Surface     Frames are cut into blocks. To the pixels of a block a surface is fitted for each exposure and camera,
             a polynomial of degree `ORDER` − 1 along both sides, all pixels with the same weight. It is kept as its
