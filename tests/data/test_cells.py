@@ -208,6 +208,11 @@ def test_a_spot_of_dust_is_named_with_its_place_and_camera(tmp_path):
     assert calset.fine.everywhere == 0.0
     (told,) = (remark for remark in calset.remarks if "their surroundings" in remark)
     assert f"[N2]: pixels near X = {calset.fine.x[patch]:.4f}" in told
+    # Its pixels are left out: what the points say is noise about the truth, also beside the spot.
+    block = block_of(calset)
+    expected = shares(block.x, block.y) * block.counts.sum(axis=-1, keepdims=True)
+    assert np.abs((block.counts - expected) / block.sigma).max() < 6.0
+    assert any("lie in spots of the field" in remark for remark in calset.remarks)
     # Written as a set of its own it says so again, and errors of many pixels are no fault of it.
     walop.write_calibration_set(tmp_path / "cells.fits", calset)
     again = read_calibration_set(tmp_path / "cells.fits")

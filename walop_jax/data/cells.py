@@ -18,7 +18,8 @@ Bad pixels  A pixel that is bad in one camera is left out of that exposure. Surf
             keeps one point for each part with pixels, at their mean position, and a surface that these can hold.
 Structure   Residuals r of a pixel about the surfaces that agree between exposures: with q = L s(1 − s), the change of
             counts by a gain of one camera (share s), Σ_{e≠e'} r_e r_e' = g² Σ_{e≠e'} q_e q_e' over exposures e,
-            whatever the noise is, as long as it is independent. See `FineStructure`.
+            whatever the noise is, as long as it is independent. See `FineStructure`. Pixels of single spots, which
+            no surface holds, are left out of all exposures.
 Sources     Golub & Welsch 1969, Mathematics of Computation 23, 221 (zeros as eigenvalues); Szegő 1939, Orthogonal
             Polynomials, §3.4 (independence of values at zeros).
 Limits      Structure that is finer than a block and no surface: in the mean it is in the values of the points, pixel by
@@ -53,6 +54,7 @@ _HUGE = 10.0  # times the median error in its block row: a mark of a bad pixel, 
 _BRIGHT = 20.0  # standard errors of the light of a pixel above which shares of it are taken
 _WHOLE = 0.2  # smallest eigenvalue of the normal matrix, 1 with all pixels, of a block with all of its points
 _SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a block hold
+_FEW = 0.05  # of the patches of a row of blocks: with more of them spots are no spots, and stay
 _ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it are left out there
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
 
@@ -162,6 +164,7 @@ class _Tally:
     spoilt: int = 0
     huge: int = 0
     left_out: int = 0
+    spots: int = 0
     lowest: float = np.inf
     highest: float = -np.inf
     first_spoilt: str = ""
@@ -200,7 +203,12 @@ class _Binning:
         """Go through all rows of blocks."""
         found, structure = [], []
         for number in range(len(self.along)):
-            points, patches = self._row_of_blocks(number)
+            points, patches, spots = self._row_of_blocks(number)
+            if spots.any():  # no surface holds a spot: all others are without it
+                tally, samples = dataclasses.replace(self.tally), len(self.samples)
+                points, *_ = self._row_of_blocks(number, spots)
+                self.tally, self.samples = tally, self.samples[:samples]
+                self.tally.spots += int(spots.sum())
             found += points
             structure.append(patches)
         remarks = self._judged()
@@ -214,8 +222,13 @@ class _Binning:
 
     # ---------------------------------------------------------------------------------------------- sums over pixels
 
-    def _row_of_blocks(self, number: int) -> tuple[list[tuple[np.ndarray, ...]], tuple[np.ndarray, ...]]:
-        """Points of a row of blocks with their data, and the structure of its parts."""
+    def _row_of_blocks(
+        self, number: int, closed: Bool[np.ndarray, "y x"] | None = None
+    ) -> tuple[list[tuple[np.ndarray, ...]], tuple[np.ndarray, ...], Bool[np.ndarray, "y x"]]:
+        """Points of a row of blocks with their data, the structure of its parts, and the pixels of spots in it.
+
+        Pixels that are `closed` are used in no exposure.
+        """
         rows = _Weights.of(self.along, [number])
         first, last = self.along.edges[number : number + 2].tolist()
         shape = (self.frames.cameras, last - first, self.frames.grid.width)
@@ -223,13 +236,14 @@ class _Binning:
         sums = []
         for exposure in range(self.frames.exposures):
             counts, sigma, used = self._pixels(exposure, first, last)
+            used = used if closed is None else used & ~closed
             light = self._light(exposure, counts, sigma, used)
             sums.append(self._sums(counts, sigma, light, used, rows))
             if not (self.known[exposure] or self.single):
                 self._add_residuals(agreeing, counts, light, used, sums[-1], rows)
         joined = _Sums(*(np.stack(arrays) for arrays in zip(*sums, strict=True)))
         points = [self._points(number, block, joined) for block in range(len(self.across))]
-        return [p for p in points if len(p[0])], self._structure(number, agreeing)
+        return [p for p in points if len(p[0])], *self._structure(number, agreeing)
 
     def _pixels(
         self, exposure: int, first: int, last: int
@@ -428,8 +442,10 @@ class _Binning:
             for total, values in zip(agreeing, made, strict=True):
                 total[:, some] += values
 
-    def _structure(self, number: int, agreeing: list[Float[np.ndarray, "k y x"]]) -> tuple[np.ndarray, ...]:
-        """Position, mean square gain and its error of the parts of a row of blocks (`FineStructure`)."""
+    def _structure(
+        self, number: int, agreeing: list[Float[np.ndarray, "k y x"]]
+    ) -> tuple[tuple[np.ndarray, ...], Bool[np.ndarray, "y x"]]:
+        """Position, mean square gain and its error of the parts of a row of blocks; its pixels in and beside spots."""
         residual, square, fourth, response, power = agreeing
         first, last = self.along.edges[number : number + 2].tolist()
 
@@ -454,7 +470,14 @@ class _Binning:
         middle = [0.5 * (edges[:-1] + edges[1:] - 1) for edges in (columns, rows)]
         x, y = self.frames.grid.at(*(values.ravel() for values in np.meshgrid(*middle)))
         measured = (weight > 0).all(axis=1) & (error > 0).all(axis=1)
-        return x[measured], y[measured], gain[measured], error[measured]
+        patches = x[measured], y[measured], gain[measured], error[measured]
+        spots = np.flatnonzero(measured)[np.unique(FineStructure(*patches).spots[:, 0])]
+        dark = np.zeros((len(rows) + 1, len(columns) + 1), bool)  # with a margin
+        if len(spots) <= _FEW * len(x):
+            dark[1:-1, 1:-1].flat[spots] = True
+        wide = np.any([np.roll(dark, step, (0, 1)) for step in np.ndindex(3, 3)], axis=0)
+        wide = np.roll(wide, (-1, -1), (0, 1))[1:-1, 1:-1]
+        return patches, np.repeat(np.repeat(wide, np.diff(rows), axis=0), np.diff(columns), axis=1)
 
     # ----------------------------------------------------------------------------------------------------- verdict
 
@@ -485,6 +508,9 @@ class _Binning:
         if tally.flagged:
             share = f"{100 * tally.flagged / tally.pixels:.2g} %"
             remarks.append(f"{self.path} [FLAG]: set in {share} of all pixels of all exposures, not used")
+        if tally.spots:
+            what = f"{tally.spots} pixel(s) of each exposure lie in spots of the field or beside them, and are left out"
+            remarks.append(f"{self.path} [N0…N{last}]: {what}")
         if tally.left_out:
             what = "lie in blocks of the field of which other exposures have far more, and are left out"
             remarks.append(f"{self.path} [N0…N{last}]: {tally.left_out} pixel(s) {what}")
