@@ -192,7 +192,7 @@ def matrix_error(calset, truth, result) -> tuple[float, float]:
     calibration = Calibration.from_fit(result.judged())
     found, covariance = calibration.matrix(x, y)
     plan = plan_for_settings(truth, Settings.default(1), calset.filters)
-    exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))
+    exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]), truth.cameras.pairs)
     error = found - np.asarray(exact).reshape(len(x), 6)
     return float(np.sqrt(np.mean(error**2))), float(
         np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2) / 6))

@@ -20,6 +20,7 @@ from walop_jax.io.plain_tables import astropy_table
 
 RUN = 64  # field points that are sampled together
 SPOT = 8.0  # standard errors from which a patch of the field holds structure of its own
+ROUNDING = 1e-10  # mean square gain of the rounding of numbers without noise
 FINE = 4.0  # standard errors from which the whole field holds some
 
 
@@ -451,7 +452,7 @@ class FineStructure:
         """Patches (row) and cameras that have far more than the field usually has, the clearest first."""
         mean, _ = self._usual
         deviate = (self.gain - max(mean, 0.0)) / self.error
-        found = np.argwhere(deviate > SPOT)
+        found = np.argwhere((deviate > SPOT) & (self.gain > ROUNDING))
         return found[np.argsort(-deviate[tuple(found.T)])]
 
 
