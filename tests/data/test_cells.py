@@ -12,7 +12,7 @@ from frames_file import write_frames
 
 import walop_jax as walop
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.cells import CELLS, ORDER
+from walop_jax.data.cells import ORDER
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import FineStructure
 from walop_jax.data.table_intensities import TableIntensities
@@ -24,6 +24,7 @@ from walop_jax.simulation.simulate import simulate
 
 WIDTH, HEIGHT = 90, 60
 GRID = Grid(WIDTH, HEIGHT, (45.0, 30.0), (0.0, 0.0), ((0.005, 0.0), (0.0, 0.005)))
+CELLS = 40
 ANGLES = np.linspace(0.0, 162.0, 10).tolist()
 
 
@@ -60,6 +61,11 @@ def written(path, counts, errors=None, change=None):
     return path
 
 
+def in_cells(path):
+    """Frames in so few cells that each has some pixels."""
+    return read_calibration_set(path, cells=CELLS)
+
+
 def block_of(calset):
     return calset.intensities.block(0, len(calset.points))
 
@@ -70,7 +76,7 @@ def shares_of(block):
 
 def test_points_are_the_polynomials_of_the_pixels_however_rough_the_light(tmp_path):
     counts = light(np.random.default_rng(1))[..., None] * shares(*GRID.xy(0, GRID.pixels))
-    calset = read_calibration_set(written(tmp_path / "frames.fits", counts))
+    calset = in_cells(written(tmp_path / "frames.fits", counts))
     assert len(calset.points) == CELLS * round(CELLS * HEIGHT / WIDTH / ORDER + 0.2) * ORDER
     block = block_of(calset)
     assert block.used.all()
@@ -100,9 +106,7 @@ def test_errors_that_know_the_noise_bias_nothing(tmp_path):
     """100 electrons with errors √N: weights 1/σ² would give 99. The mean of all is right to 0.025."""
     rng = np.random.default_rng(3)
     counts = rng.poisson(100.0, (GRID.pixels, len(ANGLES), 4)).astype(float)
-    block = block_of(
-        read_calibration_set(written(tmp_path / "frames.fits", counts, np.sqrt(np.maximum(counts, 1.0))))
-    )
+    block = block_of(in_cells(written(tmp_path / "frames.fits", counts, np.sqrt(np.maximum(counts, 1.0)))))
     mean = np.sum(block.counts / block.sigma**2) / np.sum(1.0 / block.sigma**2)
     assert mean == pytest.approx(100.0, abs=0.2)
 
@@ -127,11 +131,11 @@ def test_bad_pixels_leave_the_others_as_they_are(tmp_path):
 
     counts = light()[..., None] * shares(*GRID.xy(0, GRID.pixels))
     path = written(tmp_path / "frames.fits", counts, change=spoil)
-    calset = read_calibration_set(path)
+    calset = in_cells(path)
     block = block_of(calset)
     assert block.used.all()
     np.testing.assert_allclose(shares_of(block), shares(block.x, block.y), rtol=1e-9)
-    clean = block_of(read_calibration_set(written(tmp_path / "clean.fits", counts)))
+    clean = block_of(in_cells(written(tmp_path / "clean.fits", counts)))
     worse = block.sigma / clean.sigma
     assert worse.min() > 1.0 - 1e-9
     assert worse[:, 4].max() > 1.02
@@ -154,7 +158,7 @@ def test_a_round_field_keeps_points_where_there_are_pixels(tmp_path):
 
     counts = light()[..., None] * shares(x, y, degree=1)
     path = written(tmp_path / "frames.fits", counts, change=vignetted)
-    block = block_of(read_calibration_set(path))
+    block = block_of(in_cells(path))
     assert 300 < len(block.x) < CELLS**2 * HEIGHT / WIDTH
     assert block.used.all()
     assert np.hypot(block.x / 0.22, block.y / 0.14).max() < 1.05
@@ -174,13 +178,13 @@ def small():
 
 
 def noisy(rng, gains):
-    counts = light()[..., None] * shares(*GRID.xy(0, GRID.pixels))
+    counts = light()[..., None] * shares(*GRID.xy(0, GRID.pixels), degree=1)
     return rng.normal(counts * gains[:, None], np.sqrt(counts))
 
 
 def test_noise_has_no_structure(tmp_path):
     counts = noisy(np.random.default_rng(4), np.ones((GRID.pixels, 4)))
-    fine = read_calibration_set(written(tmp_path / "frames.fits", counts, 0.8 * np.sqrt(counts))).fine
+    fine = in_cells(written(tmp_path / "frames.fits", counts, 0.8 * np.sqrt(counts))).fine
     deviates = fine.gain / fine.error
     assert np.std(deviates) == pytest.approx(1.0, abs=0.15)
     assert fine.everywhere == 0.0
@@ -191,7 +195,7 @@ def test_a_wave_of_five_pixels_is_found_with_its_size(tmp_path):
     """Gains of 0.5 % sin(2π column/5), 0.35 % rms, half of the noise of the means of all exposures."""
     phase = 2 * np.pi * (np.arange(GRID.pixels) % WIDTH)[:, None] / 5 + np.arange(4)
     counts = noisy(np.random.default_rng(5), 1.0 + 5e-3 * np.sin(phase))
-    fine = read_calibration_set(written(tmp_path / "frames.fits", counts)).fine
+    fine = in_cells(written(tmp_path / "frames.fits", counts)).fine
     assert fine.everywhere == pytest.approx(5e-3 / np.sqrt(2.0), rel=0.15)
 
 
@@ -200,7 +204,7 @@ def test_a_spot_of_dust_is_named_with_its_place_and_camera(tmp_path):
     gains = np.ones((HEIGHT, WIDTH, 4))
     gains[20:23, 61:64, 2] = 0.94
     path = written(tmp_path / "frames.fits", noisy(np.random.default_rng(6), gains.reshape(-1, 4)))
-    calset = read_calibration_set(path)
+    calset = in_cells(path)
     patch, camera = calset.fine.spots[0]
     x, y = GRID.at(np.array([62.0]), np.array([21.0]))
     assert camera == 2
@@ -210,7 +214,7 @@ def test_a_spot_of_dust_is_named_with_its_place_and_camera(tmp_path):
     assert f"[N2]: pixels near X = {calset.fine.x[patch]:.4f}" in told
     # Its pixels are left out: what the points say is noise about the truth, also beside the spot.
     block = block_of(calset)
-    expected = shares(block.x, block.y) * block.counts.sum(axis=-1, keepdims=True)
+    expected = shares(block.x, block.y, degree=1) * block.counts.sum(axis=-1, keepdims=True)
     assert np.abs((block.counts - expected) / block.sigma).max() < 6.0
     assert any("lie in spots of the field" in remark for remark in calset.remarks)
     # Written as a set of its own it says so again, and errors of many pixels are no fault of it.
@@ -263,7 +267,7 @@ def test_a_fit_of_the_cells_is_that_of_all_pixels(tmp_path):
     made = simulate(RUN, seed=12, steady=True).calset
     write_frames(tmp_path / "frames.fits", made, raster(RUN, SIDE), dtype="f8")
     model = base_model(made, throughput_degree=2)
-    cells = read_calibration_set(tmp_path / "frames.fits")
+    cells = in_cells(tmp_path / "frames.fits")
     assert isinstance(cells.intensities, TableIntensities)
     ours, pixels = fit(Likelihood.of(cells, model)), fit(Likelihood.of(made, model, interpolate=True))
     free = pixels.sigma > 0

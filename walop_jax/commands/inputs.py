@@ -36,7 +36,7 @@ def read(
 ) -> CalibrationSet | Calibration | Run:
     """Read calibration sets (several become one), a calibration product, or the folder of a run.
 
-    Whole frames become field points, `cells` along their longer side (default: 40), which `write_calibration_set`
+    Whole frames become field points, `cells` along their longer side (default: 80), which `write_calibration_set`
     writes as a set of their own. `kinds` are kinds of exposures beyond those of the format, `effects` and `elements`
     effects and kinds of elements of your own that a fitted model may have, or the file that defines them.
 

@@ -84,7 +84,7 @@ def refit(
     any more. Where more than 5 % of the rows do, the model lacks something: the command stops, and diagnose looks for
     it.
 
-    Whole frames are read as cells: 40 along their longer side unless --cells says otherwise, 1600 field points in all,
+    Whole frames are read as cells: 80 along their longer side unless --cells says otherwise, 6400 field points in all,
     which hold what the pixels say of anything smooth. Structure that is finer is told, with its worst place. The
     calibration then holds a map of the residuals of the smooth model, as that of a set of more than 65536 points does.
 

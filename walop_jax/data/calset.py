@@ -48,7 +48,7 @@ def read_calibration_set(
 ) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
-    Whole frames become field points, the means of `cells` of their pixels along the longer side (default: 40). Oddities
+    Whole frames become field points, the means of `cells` of their pixels along the longer side (default: 80). Oddities
     that are harmless (unknown columns, masked rows, …) stand in `remarks`. `kinds` are kinds of exposures beyond
     `KINDS`, for sources of the caller's own.
 
