@@ -473,7 +473,7 @@ class _Binning:
         patches = x[measured], y[measured], gain[measured], error[measured]
         spots = np.flatnonzero(measured)[np.unique(FineStructure(*patches).spots[:, 0])]
         dark = np.zeros((len(rows) + 1, len(columns) + 1), bool)  # with a margin
-        if len(spots) <= _FEW * len(x):
+        if len(spots) <= max(4, _FEW * len(x)):
             dark[1:-1, 1:-1].flat[spots] = True
         wide = np.any([np.roll(dark, step, (0, 1)) for step in np.ndindex(3, 3)], axis=0)
         wide = np.roll(wide, (-1, -1), (0, 1))[1:-1, 1:-1]
