@@ -25,7 +25,6 @@ from own_instrument import OWN
 import walop_jax as walop
 from walop_jax.commands import COMMANDS
 from walop_jax.commands.program import UNTRUSTED
-from walop_jax.likelihood import limits
 from walop_jax.simulation.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,7 +50,7 @@ LINES = {
     "refit": [
         Line("refit set.fits -o FIT", "summary", "seconds"),
         Line("refit set.fits --clip 5 -o FIT", "summary", "seconds"),
-        Line("refit frames.fits --compress small.fits -o FIT", "summary", "minutes"),
+        Line("refit frames.fits --cells 12 -o FIT", "summary", "minutes"),
     ],
     "diagnose": [Line("diagnose set.fits -o FOUND", "diagnosis", "seconds")],
     "limits": [
@@ -206,8 +205,8 @@ def _type(line: Line, call: Call) -> None:
 
 
 def _frames(path: Path) -> None:
-    """Whole frames, so large that they are fitted by sums over cells."""
-    side = int(limits.LARGE_ABOVE**0.5) + 8
+    """Whole frames, so many pixels that cells are made of them."""
+    side = 60
     run = frame_run(side)
     write_frames(path, simulate(run, seed=6).calset, raster(run, side))
 

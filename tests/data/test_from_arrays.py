@@ -10,7 +10,7 @@ from astropy import units
 from small_run import SEED, SMALL
 
 from walop_jax.data.calset import checked, from_arrays
-from walop_jax.data.records import CalibrationSet, Compression
+from walop_jax.data.records import CalibrationSet, FineStructure
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import base_model
 from walop_jax.io.errors import DataError
@@ -85,10 +85,10 @@ def test_the_level_of_the_sky_comes_back():
     assert made().to_arrays()["sky"] is None
 
 
-def test_the_record_of_the_frames_that_a_set_stands_for_comes_back():
-    record = Compression(90_000, 271_000.0, 269_900, {"half2.wedge": 0.2305}, gain=1e-3)
-    summed = dataclasses.replace(made(), compression=record)
-    assert from_arrays(**summed.to_arrays()).compression == record
+def test_the_structure_of_the_frames_that_a_set_was_made_of_comes_back():
+    fine = FineStructure(np.zeros(1), np.ones(1), np.full((1, 4), 1e-6), np.full((1, 4), 1e-7))
+    of_frames = dataclasses.replace(made(), fine=fine)
+    assert from_arrays(**of_frames.to_arrays()).fine is fine
 
 
 def test_errors_of_the_numbers_of_a_set_come_back():

@@ -12,7 +12,6 @@ from test_writing import columns as all_columns
 from test_writing import equal
 
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.data.frames import FrameIntensities
 from walop_jax.data.grid import Grid
 from walop_jax.data.inspection import inspect
 from walop_jax.data.records import Block, Position
@@ -239,7 +238,7 @@ def test_frames_of_any_number_of_cameras(frames):
     path, block = frames
     cameras = block.counts.shape[-1]
     calset = read_calibration_set(path)
-    assert isinstance(calset.intensities, FrameIntensities)
+    assert isinstance(calset.intensities, TableIntensities)
     assert calset.cameras == cameras
     assert list(calset.exposures.further) == ["RET_1", "HWP"]
     found = calset.intensities.block(2, 9)

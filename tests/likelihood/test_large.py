@@ -71,8 +71,8 @@ def made_field(likelihood):
     return (x.min(), x.max(), y.min(), y.max())
 
 
-@pytest.mark.long  # the expansions alone: test_nodes.py; a fit of frames: test_points.py
-def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
+@pytest.mark.long  # the expansions alone: test_nodes.py
+def test_large_and_table_path_agree_to_1e_8(made, monkeypatch):
     """144 of the points: interpolated optics, blocks and a fit from a sample, beside the path that tables take."""
     sample = thinned(made.calset, 144, neighbours=1)
     assert len(sample.points) == 144
@@ -81,15 +81,15 @@ def test_frames_and_table_path_agree_to_1e_8(made, monkeypatch):
     monkeypatch.setattr(limits, "LARGE_ABOVE", 0)
     monkeypatch.setattr(search, "LARGE_TOLERANCE", 1e-6)
     monkeypatch.setattr(limits, "SAMPLE", 72)
-    frames = Likelihood.of(sample, made.model, batch=16, interpolate=True)
-    assert frames.layout.large
-    a, b = plain.expand(made.model.start), frames.expand(made.model.start)
+    large = Likelihood.of(sample, made.model, batch=16, interpolate=True)
+    assert large.layout.large
+    a, b = plain.expand(made.model.start), large.expand(made.model.start)
     size = np.sqrt(np.diag(a.matrix))
     assert a.data == pytest.approx(b.data, rel=1e-8)
     np.testing.assert_allclose(b.gradient / size, a.gradient / size, atol=1e-8 * np.sqrt(a.data))
     np.testing.assert_allclose(b.matrix / np.outer(size, size), a.matrix / np.outer(size, size), atol=1e-8)
     monkeypatch.setattr(search, "minimise", _tight(search.minimise))
-    one, other = fit(plain), fit(frames)
+    one, other = fit(plain), fit(large)
     assert other.chi2 == pytest.approx(one.chi2, rel=1e-8)
     scale = np.array([p.scale for p in made.model.parameters])
     np.testing.assert_allclose(other.values / scale, one.values / scale, atol=1e-8)
@@ -144,13 +144,3 @@ def test_misfit_of_a_large_set_is_that_of_points_spread_over_it(made, monkeypatc
     assert some != full
     assert some.camera == pytest.approx(full.camera, rel=0.1)
     assert some.matrix_element == pytest.approx(full.matrix_element, rel=0.1)
-
-
-def test_memory_is_bounded_by_what_is_allowed(made):
-    """Small memory: small slabs, read anew; the estimate stays below what was allowed."""
-    for memory in (1e9, 1e8, 5e6):
-        likelihood = Likelihood.of(made.calset, made.model, batch=64, interpolate=True, memory=memory)
-        assert likelihood.layout.memory <= memory
-    assert not likelihood.layout.kept
-    again = likelihood.expand(made.model.start)
-    assert again.data == pytest.approx(made.expand(made.model.start).data, rel=1e-12)

@@ -10,7 +10,7 @@ from frame_run import frame_run
 
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import Layout, bytes_per_point
+from walop_jax.likelihood.layout import Layout
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 
@@ -27,20 +27,14 @@ def model(calset):
     return base_model(calset, throughput_degree=2)
 
 
-@pytest.mark.parametrize("memory", [1e9, 1e7, 2e6])
-@pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("batch", [None, 7, 64, 10_000])
-def test_pieces_cover_the_set_within_its_memory(calset, model, memory, threads, batch):
-    layout = Layout.of(calset, model, memory=memory, threads=threads, batch=batch)
+def test_parts_are_whole_batches_and_cover_the_set(calset, model, batch):
+    layout = Layout.of(calset, model, batch=batch)
     assert layout.points == 400
     assert layout.batch == min(batch or limits.BATCH, 400)
-    assert layout.slab % layout.batch == 0
-    assert (layout.slabs - 1) * layout.slab < 400 <= layout.slabs * layout.slab
+    assert layout.part % layout.batch == 0
+    assert layout.part == layout.batch or 400 // layout.part >= limits.PARTS
     assert (layout.batches - 1) * layout.batch < 400 <= layout.batches * layout.batch
-    each = bytes_per_point(len(calset.exposures))
-    assert layout.kept == (2 * each * 400 <= memory)
-    # One batch for each thread is the least that there can be.
-    assert layout.memory <= max(memory, limits.READING * threads * each * layout.batch)
 
 
 def test_the_size_of_a_set_decides_how_it_is_handled(calset, model, monkeypatch):

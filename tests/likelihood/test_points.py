@@ -1,11 +1,10 @@
-"""Sets that are read anew on every pass against the same sets in memory."""
+"""The points of a set in batches and parts, and samples of them."""
 
 from __future__ import annotations
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
-import jax
 import numpy as np
 import pytest
 from frame_run import frame_run
@@ -15,9 +14,8 @@ from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.grid import Grid
 from walop_jax.data.records import Intensities
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import refit
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.layout import MeasuredPoints, PointReader, bytes_per_point, thinned
+from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 
@@ -28,7 +26,7 @@ GRID = Grid(SIDE, SIDE, (1.0, 1.0), (-RUN.field, -RUN.field), ((STEP, 0.0), (0.0
 
 
 class Counted(Intensities):
-    """Notes which slabs are asked for."""
+    """Notes which points are asked for."""
 
     def __init__(self, inner):
         self.inner, self.asked = inner, []
@@ -68,51 +66,25 @@ def calset(tmp_path_factory):
 
 
 @pytest.fixture
-def streaming(calset, monkeypatch):
-    """The same set when there is hardly any memory: three slabs of two batches of 16 points."""
-    each = bytes_per_point(len(calset.exposures))
-    monkeypatch.setattr(limits, "MEMORY", 81 * each)
-    monkeypatch.setattr(limits, "READING", 1)
-    monkeypatch.setattr(limits, "SLABS", 2)
-    monkeypatch.setattr(limits, "LARGEST_SLAB", 32 * each)
+def counted(calset, monkeypatch):
+    """The same set in three parts of two batches of 16 points, which notes what is asked for."""
+    monkeypatch.setattr(limits, "PARTS", 2)
     return dataclasses.replace(calset, intensities=Counted(calset.intensities))
 
 
-def equal(one, other):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_what_is_read_is_what_is_kept(calset, streaming):
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
-    layout = likelihood.layout
-    reader = PointReader(calset, layout.plan, likelihood.model.template)
-    kept, read = (MeasuredPoints(reader, dataclasses.replace(layout, kept=kept)) for kept in (True, False))
-    assert (len(kept), len(read), layout.slabs) == (6, 6, 3)
-    for one, other in zip(read, kept, strict=True):
-        equal(one, other)
-    for points in (kept, read):
-        assert [len(points.slab(n)) for n in range(3)] == [2, 2, 2]
-        np.testing.assert_array_equal(points.gathered("x"), calset.points.x)
-
-
-def test_every_pass_reads_every_slab_once(calset, streaming):
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
-    asked = streaming.intensities.asked
+def test_every_point_is_read_once(calset, counted):
+    likelihood = Likelihood.of(counted, base_model(calset, throughput_degree=2), batch=16)
     for _ in range(2):
-        asked.clear()
-        assert (
-            sum(int((np.asarray(c.weight[..., 0]) > 0).sum()) for c in likelihood.points)
-            == calset.intensities.rows
-        )
-        assert asked == [(0, 32), (32, 64), (64, 81)]
+        used = sum(int((np.asarray(batch.weight[..., 0]) > 0).sum()) for batch in likelihood.points)
+        assert used == calset.intensities.rows
+    assert counted.intensities.asked == [(0, 32), (32, 64), (64, 76)]
+    assert [len(likelihood.points.part(n)) for n in range(3)] == [2, 2, 1]
+    np.testing.assert_array_equal(likelihood.points.gathered("x"), calset.points.x)
 
 
-def test_expansion_and_counts_agree(calset, streaming):
-    one = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
-    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), batch=16, memory=1e9)
-    assert not one.layout.kept
-    assert other.layout.kept
+def test_expansion_and_counts_agree(calset, counted):
+    one = Likelihood.of(counted, base_model(calset, throughput_degree=2), batch=16)
+    other = Likelihood.of(calset, base_model(calset, throughput_degree=2), batch=16)
     a, b = one.expand(one.model.start), other.expand(other.model.start)
     assert a.data == b.data
     np.testing.assert_array_equal(a.matrix, b.matrix)
@@ -121,36 +93,28 @@ def test_expansion_and_counts_agree(calset, streaming):
         np.testing.assert_array_equal(found.census.rows, one.census.rows)
         assert (found.n_data, found.dof) == (other.census.n_data, a.dof)
     assert a.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
-    used = np.arange(81) % 17 != 3
-    x, y = calset.points.x[used], calset.points.y[used]
+    x, y = calset.points.x, calset.points.y
     assert a.census.field == one.census.field == (x.min(), x.max(), y.min(), y.max())
 
 
-def test_refit_of_frames_that_do_not_fit_into_memory(calset, streaming):
-    model = base_model(calset, throughput_degree=2)
-    one, other = refit(streaming, model), refit(calset, model)
-    assert one.converged
-    assert one.chi2 == pytest.approx(other.chi2, rel=1e-12)
-
-
-def test_a_fault_in_the_file_stops_the_pass(calset, streaming):
+def test_a_fault_in_the_file_stops_the_pass(calset, counted):
     def broken(start, stop):
         if start >= 32:
             raise OSError("the disk has gone")
         return calset.intensities.block(start, stop)
 
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
-    streaming.intensities.block = broken
+    likelihood = Likelihood.of(counted, base_model(calset, throughput_degree=2), batch=16)
+    counted.intensities.block = broken
     with pytest.raises(OSError, match="the disk has gone"):
         likelihood.expand(likelihood.model.start)
 
 
-def test_a_pass_may_be_left_half_way(calset, streaming):
-    likelihood = Likelihood.of(streaming, base_model(calset, throughput_degree=2), batch=16)
+def test_a_pass_may_be_left_half_way(calset, counted):
+    likelihood = Likelihood.of(counted, base_model(calset, throughput_degree=2), batch=16)
     first = next(iter(likelihood.points))
     assert first.x.shape == (16,)
     with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(lambda: len(list(likelihood.points))).result(timeout=60) == 6
+        assert pool.submit(lambda: len(list(likelihood.points))).result(timeout=60) == 5
 
 
 def test_a_sample_is_part_of_the_set(calset):

@@ -34,7 +34,7 @@ import json
 def made(**options):
     calset = simulate(RUN, seed=5).calset
     model = base_model(calset, throughput_degree=2)
-    return Likelihood.of(calset, model, batch=64, interpolate=True, memory=1e6, **options)
+    return Likelihood.of(calset, model, batch=64, interpolate=True, **options)
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_the_number_of_threads_changes_nothing(likelihood):
     for threads in (1, 2, 5):
         there = dataclasses.replace(likelihood, runner=Runner(threads=threads))
         found.append(there.expand(likelihood.model.start))
-    assert likelihood.layout.slab == 64
+    assert likelihood.layout.part == 64
     for other in found[1:]:
         assert other.data == found[0].data
         np.testing.assert_array_equal(other.gradient, found[0].gradient)
@@ -89,8 +89,8 @@ def test_two_devices_give_the_same(likelihood):
     np.testing.assert_array_equal(found["gradient"], here.gradient)
 
 
-def test_an_error_in_one_slab_ends_the_pass():
-    """It comes out as it is, and no slab that has not begun is begun."""
+def test_an_error_in_one_part_ends_the_pass():
+    """It comes out as it is, and no part that has not begun is begun."""
     begun = []
 
     def work(number):
@@ -105,8 +105,8 @@ def test_an_error_in_one_slab_ends_the_pass():
     assert len(begun) < 50
 
 
-def test_results_come_in_the_order_of_the_slabs():
-    """Also where the first ones take longest; the last slab is a part of one."""
+def test_results_come_in_the_order_of_the_parts():
+    """Also where the first ones take longest; the last part has fewer points."""
 
     def work(number):
         time.sleep(0.002 * (7 - number))

@@ -43,9 +43,6 @@ from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelExpansion, frame_sums
-from walop_jax.likelihood.layout import MeasuredPoints
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.light import instrument_matrix
 from walop_jax.model.parameters import values_of
@@ -157,7 +154,6 @@ def test_cost_per_iteration():
             f"({side**2 / full:9,.0f} points/s), error of the optics {near.optics.error:.0e}, peak {peak():.2f} GB",
             end="",
         )
-        assert likelihood.layout.memory < 2e9
     # Linear in the points, once there are many.
     n, data, full = rows[-1]
     assert (full - data) / n < 2.0 * rows[1][2] / rows[1][0]
@@ -166,7 +162,7 @@ def test_cost_per_iteration():
 @pytest.mark.benchmark
 @pytest.mark.parametrize("side", [1024, 4096])
 def test_whole_frames(tmp_path, side):
-    """Frames on disk: fitted, with the residual map, and compressed. Writing those of 4096 × 4096 takes ten minutes."""
+    """Frames on disk: read as cells, and fitted. Writing those of 4096 × 4096 takes ten minutes."""
     path = tmp_path / "frames.fits"
     write_frames(path, made(side), raster(RUN, side))
     began = time.perf_counter()
@@ -176,21 +172,17 @@ def test_whole_frames(tmp_path, side):
     fitted = time.perf_counter() - began
     residuals = residual_map(result)
     whole = time.perf_counter() - began
-    assert isinstance(result.expansion, PixelExpansion)
-    again = seconds(lambda: frame_sums(result.likelihood, result.values))
-    small = compressed(result.expansion)
     truth = np.asarray(values_of(simulate(RUN, seed=3).truth))
     known = result.sigma > 0
     pulls = (result.values - truth)[known] / result.sigma[known]
     print(
-        f"\n{side**2:,} pixels: checked {read:.1f} s, fitted {fitted:.1f} s, {result.minimum.steps} passes of "
-        f"{again:.1f} s; with the residual map {whole:.1f} s, peak {peak():.2f} GB; χ²/dof "
+        f"\n{side**2:,} pixels: read {read:.1f} s, fitted {fitted:.1f} s, {result.minimum.steps} steps; "
+        f"with the residual map {whole:.1f} s, peak {peak():.2f} GB; χ²/dof "
         f"{result.chi2 / result.dof:.5f}, {result.minimum.message}; residual map {residuals.significance():+.1f} "
-        f"standard deviations above noise; pulls of the parameters: rms {np.sqrt(np.mean(pulls**2)):.2f}; "
-        f"{len(small.points)} points stand for them"
+        f"standard deviations above noise; pulls of the parameters: rms {np.sqrt(np.mean(pulls**2)):.2f}"
     )
     assert result.converged
-    assert peak() < 4.0
+    assert peak() < 2.0
     assert whole < 600.0
 
 
@@ -200,7 +192,7 @@ def matrix_error(calset, truth, result) -> tuple[float, float]:
     calibration = Calibration.from_fit(result.judged())
     found, covariance = calibration.matrix(x, y)
     plan = plan_for_settings(truth, Settings.default(1), calset.filters)
-    exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]))
+    exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]), truth.cameras.pairs)
     error = found - np.asarray(exact).reshape(len(x), 6)
     return float(np.sqrt(np.mean(error**2))), float(
         np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2) / 6))
@@ -258,19 +250,4 @@ def test_work_per_point():
         f"{1e6 * best / n:.1f} µs, {cost['flops'] / best / 1e9:.1f} Gflop/s, "
         f"{cost['bytes accessed'] / best / 1e9:.1f} GB/s",
         end="",
-    )
-
-
-@pytest.mark.benchmark
-def test_reading_frames(tmp_path):
-    side = 512
-    write_frames(tmp_path / "frames.fits", made(side), raster(RUN, side))
-    calset = read_calibration_set(tmp_path / "frames.fits")
-    likelihood = Likelihood.of(calset, base_model(calset))
-    points = MeasuredPoints(likelihood.points.reader, dataclasses.replace(likelihood.layout, kept=False))
-    size = likelihood.layout.slab
-    raw = seconds(lambda: [calset.intensities.block(n, n + size) for n in range(0, side**2, size)] and None)
-    ready = seconds(lambda: [None for _ in points])
-    print(
-        f"\nframes: {side**2 / raw:,.0f} points/s read, {side**2 / ready:,.0f} points/s ready for the engine"
     )

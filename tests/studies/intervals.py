@@ -40,13 +40,10 @@ from walop_jax.data.grid import Grid  # noqa: E402
 from walop_jax.data.records import CalibrationSet  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
-from walop_jax.diagnosis.trust import examined, pixel_structure  # noqa: E402
+from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import FitResult, fit, refit, with_honest_errors  # noqa: E402
-from walop_jax.fit.stand_in import with_pixel_structure  # noqa: E402
 from walop_jax.fit.verdict import Quality  # noqa: E402
-from walop_jax.likelihood import limits  # noqa: E402
-from walop_jax.likelihood.compressed import compressed  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.effects import effect_by_name  # noqa: E402
 from walop_jax.model.effects.in_models import with_effects  # noqa: E402
@@ -140,8 +137,8 @@ def gains(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]]
 
 
 def frames(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]]]:
-    """Pixels are fitted by sums, and the set that stands for them is what a user keeps."""
-    side, limits.LARGE_ABOVE = 72, 0
+    """Whole frames, read as cells."""
+    side = 72
     plan = frame_run(side)
     step = 2 * plan.field / (side - 1)
     grid = Grid(side, side, (1.0, 1.0), (-plan.field, -plan.field), ((step, 0.0), (0.0, step)))
@@ -154,9 +151,7 @@ def frames(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]
             write_frames(path, with_block(made.calset, counts=counts), grid, dtype="f8")
             calset = read_calibration_set(path)
             model = base_model(calset, throughput_degree=2)
-            of_pixels = with_honest_errors(fit(Likelihood.of(calset, model, interpolate=True)))
-            small = with_pixel_structure(compressed(of_pixels.expansion), pixel_structure(of_pixels))
-            found = examined(fit(Likelihood.of(small, model, interpolate=False)), as_written=True)
+            found = examined(with_honest_errors(fit(Likelihood.of(calset, model))), as_written=True)
             rng = np.random.default_rng(seed)
             yield found, pulls(Calibration.from_fit(found), made.truth, made.calset, rng, gains=wave)
 

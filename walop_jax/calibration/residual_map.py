@@ -24,13 +24,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.calibration.matrix import ResidualMap, residual_names
+from walop_jax.data.cells import ORDER
 from walop_jax.data.grid import Grid
 from walop_jax.data.settings import Settings
 from walop_jax.fit.refit import FitResult, Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux
-from walop_jax.likelihood.frames import FrameSums, PixelExpansion, in_blocks, information
 from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -40,19 +40,21 @@ from walop_jax.model.plan import Plan
 POINTS_PER_CELL = 64
 """Field points of a cell of the residual map: its errors are an eighth of those of a point."""
 
+MOST_CELLS = 128
+"""Cells of the residual map along a side at most."""
+
 
 def _changes(
     vectors: Float[Any, "n k 4"], stokes: Float[Any, "n 4"], unit: Float[Any, "n k"], pairs: Sequence[Any]
 ) -> Float[Any, "n d k"]:
-    """Counts that a change of each quantity of the map adds for light of unit flux, in numpy or inside a program."""
-    xp = jnp if isinstance(unit, jax.Array) else np
+    """Counts that a change of each quantity of the map adds for light of unit flux."""
     first, second = np.array(pairs).T
     # One row of signs for each arm: first camera minus second.
     signs = np.eye(unit.shape[1])[first] - np.eye(unit.shape[1])[second]
     total = vectors[:, first, 0] + vectors[:, second, 0]
-    elements = 0.5 * xp.einsum("na,ns,ak->nask", total, stokes[:, :3], signs)
+    elements = 0.5 * jnp.einsum("na,ns,ak->nask", total, stokes[:, :3], signs)
     later = unit[:, None] * np.abs(signs[1:])
-    return xp.concatenate([elements.reshape(len(unit), -1, unit.shape[1]), later], axis=1)
+    return jnp.concatenate([elements.reshape(len(unit), -1, unit.shape[1]), later], axis=1)
 
 
 def _point_sums(
@@ -88,10 +90,10 @@ def _sums(*given: Any) -> Float[Array, "p n"]:
     )
 
 
-def cells_for(points: int, census: Census) -> Grid:
-    """A grid of square-ish cells over the used part of the field: `POINTS_PER_CELL` points in each, or more."""
+def cells_for(points: int, census: Census, points_per_cell: int = POINTS_PER_CELL) -> Grid:
+    """A grid of square-ish cells over the used part of the field: so many points in each, or more."""
     low_x, high_x, low_y, high_y = census.field
-    side = int(np.clip(np.sqrt(points / POINTS_PER_CELL), 1, limits.CELLS))
+    side = int(np.clip(np.sqrt(points / points_per_cell), 1, MOST_CELLS))
     width, height = (high_x - low_x) / side or 1.0, (high_y - low_y) / side or 1.0
     return Grid(side, side, (0.5, 0.5), (low_x, low_y), ((width, 0.0), (0.0, height)))
 
@@ -119,12 +121,10 @@ def _main_setting(
 
 
 def residual_map(result: FitResult) -> ResidualMap:
-    """The map of the residuals of a fit: from the sums of its last pass, or by one more pass over the points.
+    """The map of the residuals of a fit, by one more pass over the points.
 
     >>> walop.residual_map(result).excess()["m21"]  # doctest: +SKIP
     """
-    if isinstance(result.expansion, PixelExpansion):
-        return residual_map_of_pixels(result.expansion.sums)
     return residual_map_at(result.likelihood, result.values, result.expansion)
 
 
@@ -134,11 +134,14 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | No
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
     setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
-    grid = cells_for(likelihood.layout.points, likelihood.census if near is None else near.census)
+    # The points of whole frames stand for many pixels: those of one block of them are a cell.
+    points_per_cell = ORDER**2 if likelihood.calset.fine is not None else POINTS_PER_CELL
+    census = likelihood.census if near is None else near.census
+    grid = cells_for(likelihood.layout.points, census, points_per_cell)
     count = grid.pixels
 
     def work(number: int) -> Vector:
-        batches = likelihood.points.slab(number)
+        batches = likelihood.points.part(number)
         cell = np.concatenate([cell_of(grid, np.asarray(batch.x), np.asarray(batch.y)) for batch in batches])
         # Padded points carry no weight, hence zeros.
         columns = [_sums(instrument, likelihood.plan, jnp.asarray(chosen), nodes, c) for c in batches]
@@ -146,45 +149,13 @@ def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | No
         return np.concatenate(sums)
 
     layout = likelihood.layout
-    slabs = likelihood.runner.each("residual map", work, layout.points, layout.slab)
-    total = functools.reduce(np.add, slabs).reshape(-1, count)
+    parts = likelihood.runner.each("residual map", work, layout.points, layout.part)
+    total = functools.reduce(np.add, parts).reshape(-1, count)
     n = len(residual_names(len(instrument.cameras.pairs)))
     matrices = np.zeros((count, n, n))
     i, j = np.triu_indices(n)
     matrices[:, i, j] = matrices[:, j, i] = total[2 + n :].T
     return _solved_map(grid, setting, total[0], total[1], total[2 : 2 + n], matrices)
-
-
-def residual_map_of_pixels(frame: FrameSums) -> ResidualMap:
-    """The residual map of whole frames: from the sums of cells, with smooth quantities in their middle."""
-    likelihood, cells = frame.likelihood, frame.cells
-    exposures = likelihood.calset.exposures
-    measured = frame.sums.used.any(axis=(1, 2))  # not those of a table beside the frames
-    settings = Settings.of(exposures, likelihood.plan.moving)
-    setting, chosen = _main_setting(settings, exposures.clp_in & measured)
-    blocks = (POINTS_PER_CELL**0.5 / cells.side, max(cells.shape) / limits.CELLS)
-    together = int(np.ceil(max(1.0, *blocks)))
-    s, t = np.meshgrid(*cells.middles())
-    smooth = frame.smooth(s.ravel(), t.ravel())
-    pairs = frame.instrument.cameras.pairs
-    n = len(residual_names(len(pairs)))
-    right, matrix = np.zeros((n, s.size)), np.zeros((n, n, s.size))
-    matrices = information(frame).reshape(likelihood.cameras, likelihood.cameras, len(chosen), -1)
-    pull = frame.sums.pull.reshape(likelihood.cameras, len(chosen), -1)
-    for exposure in np.flatnonzero(chosen):
-        band = likelihood.plan.band_of[exposure, 0]
-        vectors, stokes = np.asarray(smooth.vectors)[:, band], np.asarray(smooth.stokes)[:, exposure]
-        change = _changes(vectors, stokes, np.asarray(smooth.unit)[..., exposure], pairs)
-        right += np.einsum("cdk,kc->dc", change, pull[:, exposure])
-        matrix += np.einsum("cdk,klc,cfl->dfc", change, matrices[:, :, exposure], change, optimize=True)
-    degrees = likelihood.cameras - np.where(likelihood.flux_known, 0.0, frame.instrument.cameras.fluxes)
-    freedom = np.einsum("e,erc->rc", degrees[chosen], frame.sums.used[chosen])
-    right, matrix = right.reshape(n, *s.shape), matrix.reshape(n, n, *s.shape)
-    shaped = (frame.sums.chi2[chosen].sum(axis=0), freedom, right, matrix)
-    sums = [in_blocks(values, together) for values in shaped]
-    grid = cells.blocks(together, sums[0].shape)
-    chi2, freedom, right, matrix = (values.reshape(*values.shape[:-2], -1) for values in sums)
-    return _solved_map(grid, setting, chi2, freedom, right, np.moveaxis(matrix, 2, 0))
 
 
 def _solved_map(

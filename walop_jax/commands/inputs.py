@@ -30,13 +30,16 @@ ModelLike: TypeAlias = "Model | PathLike | None"
 def read(
     *paths: PathLike,
     kinds: Collection[str] = (),
+    cells: int | None = None,
     effects: Effects = None,
     elements: PathLike | Sequence[type] | None = None,
 ) -> CalibrationSet | Calibration | Run:
     """Read calibration sets (several become one), a calibration product, or the folder of a run.
 
-    `kinds` are kinds of exposures beyond those of the format, `effects` and `elements` effects and kinds of elements of
-    your own that a fitted model may have, or the file that defines them.
+    Whole frames become field points, `cells` along their longer side (default: 80), which `write_calibration_set`
+    writes as a set of their own. `kinds` are kinds of exposures beyond those of the format, `effects` and `elements`
+    effects and kinds of elements of your own that a fitted model may have, or the file that defines them.
+
     Raises `DataError`, naming file, extension, column and row, for what cannot be read or trusted.
 
     >>> walop.read("night.fits").instrument
@@ -60,7 +63,7 @@ def read(
         return Run(first, catalogue_of(effects))
     if len(paths) == 1 and "PRODVERS" in primary_keywords(first):
         return read_calibration(first, catalogue_of(effects))
-    return read_calibration_set(*paths, kinds=kinds)
+    return read_calibration_set(*paths, kinds=kinds, cells=cells)
 
 
 def paths_of(data: Sets) -> tuple[PathLike, ...]:
@@ -78,15 +81,16 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
     return tuple(paths)
 
 
-def set_of(data: Sets, instrument: Instrument | None = None) -> CalibrationSet:
-    """A checked set: files are checked as they are read, tables in memory here."""
+def set_of(data: Sets, instrument: Instrument | None = None, cells: int | None = None) -> CalibrationSet:
+    """A checked set: files are checked as they are read, tables in memory here; `cells` are those of whole frames."""
     from walop_jax import CalibrationSet
     from walop_jax.data.calset import checked, read_calibration_set
     from walop_jax.data.kinds import KINDS
     from walop_jax.data.table_intensities import TableIntensities
 
     if not isinstance(data, CalibrationSet):
-        return read_calibration_set(*paths_of(data), kinds=() if instrument is None else instrument.kinds)
+        kinds = () if instrument is None else instrument.kinds
+        return read_calibration_set(*paths_of(data), kinds=kinds, cells=cells)
     if data.inputs or not isinstance(data.intensities, TableIntensities):
         return data
     return checked(data, set(data.exposures.kind.tolist()) - set(KINDS))
@@ -99,12 +103,13 @@ def set_and_model(
     effects: Effects = None,
     *,
     output: PathLike | None = None,
+    cells: int | None = None,
 ) -> tuple[CalibrationSet, Model]:
     """Calibration sets as one, and the model to fit to them.
 
     `model` is one, or a model file (None: the base model); `instrument` as designed, or its name or description file
     (None: that of the sets); `effects` are those that a model file may name. With `output` the folder of a
-    run is written: it is made from files, so that it can be made again.
+    run is written: it is made from files, so that it can be made again. `cells` are those of whole frames.
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
@@ -119,7 +124,7 @@ def set_and_model(
             raise ValueError("with output, give model and instrument as files: then it can be made again")
         paths_of(data)
     design = design_of(instrument)
-    calset = set_of(data, design)
+    calset = set_of(data, design, cells)
     if output is not None and design is not None and not design.cameras.pairs:
         what = f"{design.name}: no arm has two cameras, so there is no instrument matrix and no calibration to write"
         raise DataError(f"{what}; fit it in Python, without output")

@@ -27,7 +27,6 @@ from walop_jax.commands.inputs import (
     shown_with_accuracy,
 )
 from walop_jax.commands.products import Effects, InstrumentLike
-from walop_jax.io.atomic import check_output
 from walop_jax.io.names import CLIPPED, FAILED, PRODUCT, SUMMARY
 from walop_jax.io.progress import Stage, repeated
 from walop_jax.io.text import json_text
@@ -40,15 +39,12 @@ STAGES = ("reading", "fitting", "examining", "mapping")  # also of the commands 
 
 OPTIONS = {
     "output": Option("Folder of the results.", metavar="RUN", kind=Path, short="-o", required=True),
-    "memory": Option("Memory for the data, in GB.", metavar="GB", kind=float, least=0.1),
+    "cells": Option("Cells of whole frames along their longer side.", metavar="N", kind=int, least=1),
     "clip": Option(
         "Leave out single intensities so many standard errors off; 5 is usual.",
         metavar="SIGMA",
         kind=float,
         least=3.0,
-    ),
-    "compress": Option(
-        "Write whole frames as a small set with the same information.", metavar="SET.fits", kind=Path
     ),
 }
 
@@ -57,7 +53,6 @@ OPTIONS = {
     stages=STAGES,
     writes=(PRODUCT, SUMMARY, CLIPPED),
     random=True,
-    outputs=("output", "compress"),
     options=OPTIONS,
 )
 def refit(
@@ -68,8 +63,7 @@ def refit(
     output: PathLike | None = None,
     instrument: InstrumentLike = None,
     effects: Effects = None,
-    memory: float | None = 2.0,
-    compress: PathLike | None = None,
+    cells: int | None = None,
     goal: float | None = None,
     clip: float | None = None,
 ) -> Outcome[FitResult]:
@@ -92,11 +86,9 @@ def refit(
     any more. Where more than 5 % of the rows do, the model lacks something: the command stops, and diagnose looks for
     it.
 
-    Sets of more than 65536 points (whole frames) are read in slabs on every pass. The calibration then holds a map of
-    the residuals of the smooth model. --compress makes of them a set of some hundred field points, a megabyte: refit,
-    diagnose, limits, check and sample read it like any other set and answer in seconds as from all pixels, near the
-    values that were fitted, with a warning when these have moved too far. Structure smaller than a twentieth of the
-    field is not in it.
+    Whole frames are read as cells: 80 along their longer side unless --cells says otherwise, 6400 field points in all,
+    which hold what the pixels say of anything smooth. Structure that is finer is told, with its worst place. The
+    calibration then holds a map of the residuals of the smooth model, as that of a set of more than 65536 points does.
 
     In Python: the fit, whose `clipped` are the rows left out and whose `calset` has them flagged. Raises `DataError`
     for data that cannot be trusted, ValueError for a model that does not fit.
@@ -110,8 +102,7 @@ def refit(
     from walop_jax.calibration.product import write_calibration
     from walop_jax.calibration.residual_map import residual_map
     from walop_jax.calibration.summary import summary
-    from walop_jax.data.write import write_calibration_set
-    from walop_jax.diagnosis.trust import examined, stand_in
+    from walop_jax.diagnosis.trust import examined
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
@@ -119,22 +110,19 @@ def refit(
     from walop_jax.science.field_accuracy import accuracy_of_fit, verdict_of_fit
 
     wanted = goal_of(goal) or GOAL
-    if compress is not None:
-        check_output(compress, overwrite=job.overwrite)
     job.begin("reading")
-    calset, chosen = set_and_model(data, model, instrument, effects, output=output)
+    calset, chosen = set_and_model(data, model, instrument, effects, output=output, cells=cells)
     with repeated(job.progress) as say:
         if clip is None:
-            fitted = fit(calset, chosen, progress=say, memory=None if memory is None else 1e9 * memory)
+            fitted = fit(calset, chosen, progress=say)
         else:
             say(Stage("fitting without outliers", "fitting"))
             fitted = with_honest_errors(clipped(calset, chosen, clip))
         say(Stage("looking for patterns in the residuals", "examining"))
         result = examined(fitted, job.seed)
         accuracy = accuracy_of_fit(result, wanted)
-    if compress is not None and result.converged:
-        write_calibration_set(compress, stand_in(result), overwrite=job.overwrite)
-    mapped = output is not None and result.likelihood.layout.large and result.converged
+    many = result.likelihood.layout.large or calset.fine is not None
+    mapped = output is not None and many and result.converged
     residuals = residual_map(result) if mapped else None
     misfit = describe(result) if output is not None and not result.explains_data else None
     verdict, shown = verdict_of_fit(result, accuracy), shown_with_accuracy(result, accuracy)

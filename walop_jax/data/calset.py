@@ -12,18 +12,18 @@ import numpy as np
 
 from walop_jax.data import checks, plausible, schema
 from walop_jax.data.celestial import ICRS, made_icrs
-from walop_jax.data.frames import FrameIntensities, frame_stack, image_names
+from walop_jax.data.cells import cells_of
+from walop_jax.data.frames import frames_of, image_names
 from walop_jax.data.hdus import filter_columns
 from walop_jax.data.kinds import CALIBRATION_PLATE, KINDS, POLARISER
 from walop_jax.data.merge import merge_calibration_sets
 from walop_jax.data.records import (
     ERROR_WORDS,
     CalibrationSet,
-    Compression,
     Exposures,
     FilterCurve,
+    FineStructure,
     InputFile,
-    Intensities,
     Points,
     Site,
     Sources,
@@ -31,24 +31,26 @@ from walop_jax.data.records import (
 )
 from walop_jax.data.repeats import mask_repeats, repeated_counts
 from walop_jax.data.settings import builtin_filter
-from walop_jax.data.table_intensities import TableIntensities, table_intensities, usable
+from walop_jax.data.table_intensities import ONE_CAMERA, TableIntensities, table_intensities
 from walop_jax.data.units import Place, check_units, unit_of
-from walop_jax.data.write import EXTENSION, read_compression, remark, set_tables
+from walop_jax.data.write import STRUCTURE, read_structure, set_tables
 from walop_jax.io.errors import PathLike, fail, nearest
 from walop_jax.io.fits_reading import OpenFile, open_fits
 
 _IMAGE = re.compile(r"[NE](0|[1-9][0-9]{0,2})")  # of one camera: counts or errors
 _NO_SETS = (".csv", ".ecsv", ".txt", ".dat", ".vot", ".xml", ".json", ".toml", ".nc", ".npz", ".h5")
 _NAN = float("nan")
-_SAMPLE = 8  # image rows looked at when frames are opened; every block is checked again as it is read
+_COMPRESSED = "COMPRESSION"  # extension of sets that stood for the pixels of frames near one set of values
 
 
-def read_calibration_set(*paths: PathLike, kinds: Collection[str] = ()) -> CalibrationSet:
+def read_calibration_set(
+    *paths: PathLike, kinds: Collection[str] = (), cells: int | None = None
+) -> CalibrationSet:
     """Read and check one calibration set, merging several files into one.
 
-    Whole frames are not read, only described; their blocks are checked as they are read. Oddities that are
-    harmless (unknown columns, masked rows, …) stands in `remarks`. `kinds` are kinds of exposures beyond `KINDS`,
-    for sources of the caller's own.
+    Whole frames become field points, the means of `cells` of their pixels along the longer side (default: 80). Oddities
+    that are harmless (unknown columns, masked rows, …) stand in `remarks`. `kinds` are kinds of exposures beyond
+    `KINDS`, for sources of the caller's own.
 
     Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
     """
@@ -56,7 +58,7 @@ def read_calibration_set(*paths: PathLike, kinds: Collection[str] = ()) -> Calib
         raise fail("no file was given", advice="name at least one calibration set")
     sets: dict[str, CalibrationSet] = {}
     for path in paths:
-        calset = _read_one(Path(path), kinds)
+        calset = _read_one(Path(path), kinds, cells)
         if (same := sets.setdefault(calset.inputs[0].sha256, calset)) is not calset:
             advice = "name each file once: repeated data would shrink the errors"
             raise fail(f"has the same bytes as {same.inputs[0].path}", file=path, advice=advice)
@@ -64,7 +66,7 @@ def read_calibration_set(*paths: PathLike, kinds: Collection[str] = ()) -> Calib
     return calsets[0] if len(calsets) == 1 else merge_calibration_sets(*calsets)
 
 
-def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
+def _read_one(path: Path, kinds: Collection[str], cells: int | None) -> CalibrationSet:
     if path.is_dir():
         advice = f"a calibration set is a FITS file; walop-jax report {path} shows a folder of results"
         raise fail("is a folder", file=path, advice=advice)
@@ -72,11 +74,11 @@ def _read_one(path: Path, kinds: Collection[str]) -> CalibrationSet:
         advice = "a calibration set is a FITS file (walop-jax docs files); walop_jax.from_arrays makes one of arrays"
         raise fail("is not a calibration set", file=path, advice=advice)
     with open_fits(path, "write the file again") as opened:
-        calset = _from_hdus(opened, (*KINDS, *kinds))
+        calset = _from_hdus(opened, (*KINDS, *kinds), cells)
     return dataclasses.replace(calset, inputs=(InputFile(path, opened.sha256),))
 
 
-def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
+def _from_hdus(opened: OpenFile, kinds: Collection[str], cells: int | None) -> CalibrationSet:
     path, remarks = opened.path, list(opened.remarks)
     primary = opened.hdus[0].header
     instrument, site = _header(primary, path)
@@ -84,7 +86,11 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
     if images and "INTENSITIES" in hdus:
         raise fail("has frames and a table of intensities", file=path, advice="use one file for each")
     if images and opened.compressed:
-        raise fail("frames are read in slabs", file=path, advice="unpack the file with gunzip")
+        raise fail("frames are read some rows at a time", file=path, advice="unpack the file with gunzip")
+    if _COMPRESSED in hdus:
+        what = "the field points stand for pixels near values of another fit; such sets are no longer read"
+        advice = "give the frames of which it was made: they are read as cells, for any fit"
+        raise fail(what, file=path, extension=_COMPRESSED, advice=advice)
     tables = {}
     remarks += _unused_words(opened, hdus)
     for name in ("EXPOSURES", *(() if images else ("POINTS", "INTENSITIES")), "FILTERS", "SOURCES"):
@@ -111,7 +117,8 @@ def _from_hdus(opened: OpenFile, kinds: Collection[str]) -> CalibrationSet:
         kinds=kinds,
         remarks=remarks,
         images=images,
-        compression=None if EXTENSION not in hdus else read_compression(hdus[EXTENSION], path),
+        cells=cells,
+        structure=hdus.get(STRUCTURE),
         stated_errors=_stated_errors(primary, path),
     )
 
@@ -126,13 +133,16 @@ def assembled(
     kinds: Collection[str] = KINDS.keys(),
     remarks: Iterable[str] = (),
     images: Mapping[str, Any] | None = None,
-    compression: Compression | None = None,
+    cells: int | None = None,
+    structure: Any = None,
+    fine: FineStructure | None = None,
     stated_errors: StatedErrors | None = None,
 ) -> CalibrationSet:
     """A checked calibration set from its tables, columns by name in kind and unit of the schema.
 
     FILTERS and SOURCES may be missing; with `images` (HDUs of whole frames by name) POINTS and INTENSITIES are not
-    used. `path` is what errors and remarks call the set.
+    used: they are made of `cells` of the frames. `structure` is the HDU of what is finer than the points of a set that
+    was made of frames, `fine` the same from memory. `path` is what errors and remarks call the set.
 
     Raises `DataError` for whatever numbers cannot be meant.
     """
@@ -149,7 +159,7 @@ def assembled(
     if "SOURCES" in tables:
         sources = checks.make_sources(tables["SOURCES"], Place(path, "SOURCES"), filters)
     if images:
-        intensities, points, odd = _frames(images, exposures, instrument, path)
+        intensities, points, fine, odd = _cells(images, exposures, instrument, path, cells)
         remarks += odd
     else:
         points = checks.make_points(tables["POINTS"], instrument, Place(path, "POINTS"))
@@ -160,15 +170,18 @@ def assembled(
         remarks += odd + repeated
         rows = intensities.exposure
         numbers = intensities.counts, intensities.sigma, intensities.used
-        doubts = plausible.of_counts(*numbers, measured=~exposures.flux_known[rows], group=rows)
+        # Of many pixels each, with the errors of their mean, are the rows of a set that was made of frames.
+        photons = ~exposures.flux_known[rows] & (structure is None and fine is None)
+        doubts = plausible.of_counts(*numbers, measured=photons, group=rows)
         remarks += [place.remark(what, column) for column, what in doubts]
         idle = np.setdiff1d(np.arange(len(exposures)), intensities.exposure[intensities.used])
         if len(idle):
             names = ", ".join(map(str, exposures.exposure[idle][:5])) + (" …" if len(idle) > 5 else "")
             remarks.append(f"{path} [INTENSITIES]: no used row for exposure(s) {names}")
-    remarks += repeated_counts(intensities, exposures, points, path, compression)
-    if compression is not None:
-        remarks.append(remark(compression, len(points)))
+    if structure is not None:
+        fine = read_structure(structure, intensities.cameras, path)
+        remarks += _spots(fine, path)
+    remarks += repeated_counts(intensities, exposures, points, path)
     used = np.unique(exposures.filter).tolist()
     if idle_curves := [name for name in filters if name not in {*used, *sources.filter.tolist()}]:
         what = f"the curve of {', '.join(idle_curves)} is used by no exposure (FILTER is {', '.join(used)} there)"
@@ -183,7 +196,7 @@ def assembled(
         filters=filters | {name: builtin_filter(name) for name in sorted(set(used) - set(filters))},
         intensities=intensities,
         remarks=tuple(remarks),
-        compression=compression,
+        fine=fine,
         stated_errors=stated_errors or StatedErrors(),
     )
 
@@ -263,9 +276,9 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
     for number, hdu in enumerate(opened.hdus[1:], start=1):
         name = hdu.name.strip().upper()
         image = name == "FLAG" or _IMAGE.fullmatch(name)
-        kind = tables if name in (*schema.TABLES, EXTENSION) else images if image else None
+        kind = tables if name in (*schema.TABLES, STRUCTURE, _COMPRESSED) else images if image else None
         if kind is None:
-            expected = (*schema.TABLES, EXTENSION, *four)
+            expected = (*schema.TABLES, STRUCTURE, *four)
             remarks.append(f"{opened.path} [{name or number}]: unknown extension ({nearest(name, expected)})")
         elif name in kind:
             raise fail("is there twice", file=opened.path, extension=name, advice="remove one")
@@ -277,44 +290,41 @@ def _extensions(opened: OpenFile, remarks: list[str]) -> tuple[dict[str, Any], d
     return tables, images
 
 
-def _frames(
-    images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path
-) -> tuple[Intensities, Points, list[str]]:
-    """Describe frames, and check a few rows of pixels for faults of the whole; doubts about these."""
+def _cells(
+    images: Mapping[str, Any], exposures: Exposures, instrument: str, path: Path, cells: int | None
+) -> tuple[TableIntensities, Points, FineStructure, list[str]]:
+    """The cells of whole frames as field points with their intensities, structure finer than these, and remarks."""
     if np.any(bad := exposures.direct("standard")):
         what = f"EXPOSURE {exposures.exposure[bad][0]} is a standard, and a pixel of a frame has no SOURCE"
         advice = "give standards in a table, in another file"
         raise Place(path, "EXPOSURES").fail(what, "KIND", advice)
-    grid, stack = frame_stack(images, len(exposures), path)
-    checks.check_cameras(instrument, len(stack.counts), Place(path, "N0"), "")
-    width, total = grid.width, grid.pixels
-    corners = [grid.xy(n, n + 1) for n in (0, width - 1, total - width, total - 1)]
-    x, y = (np.concatenate(coordinates) for coordinates in zip(*corners, strict=True))
+    frames = frames_of(images, len(exposures), path)
+    checks.check_cameras(instrument, frames.cameras, Place(path, "N0"), "")
+    width, height = frames.grid.width, frames.grid.height
+    x, y = frames.grid.at(np.array([0, width - 1, 0, width - 1]), np.array([0, 0, height - 1, height - 1]))
     checks.make_points({"POINT": np.arange(4), "X": x, "Y": y}, instrument, Place(path, "N0"))
-    intensities = FrameIntensities(grid, (stack,))
-    place, last = Place(path, "N0"), intensities.cameras - 1
-    sampled = [int(row) for row in np.unique(np.linspace(0, grid.height - 1, _SAMPLE).astype(int))]
-    spoilt = number = 0
-    lowest, highest = np.inf, -np.inf
-    remarks, photons = dict[str, None](), ~exposures.flux_known
-    for row in sampled:
-        counts, sigma, flag = intensities.read(stack, row * width, (row + 1) * width)
-        used, bad, _ = usable(counts, sigma, flag)
-        intensities.block(row * width, (row + 1) * width)  # refuses errors that are not positive
-        spoilt, number = spoilt + int(bad.sum()), number + bad.size
-        lit = (used & photons).ravel()
-        cameras = intensities.cameras
-        doubts = plausible.of_errors(counts.reshape(-1, cameras), sigma.reshape(-1, cameras), lit)
-        remarks |= dict.fromkeys(f"{path} [E0…E{last}]: {what}" for _, what in doubts)
-        if np.any(used):
-            values = counts[used]
-            lowest, highest = min(lowest, values.min()), max(highest, values.max())
-    if spoilt > 0.2 * number:
-        what = f"{100 * spoilt / number:.0f} % of the pixels looked at are not finite or far below zero"
-        raise place.fail(what, f"N0…N{last}, E0…E{last}", "repair the reduction, or set the FLAG image")
-    if lowest == highest and number > 1:
-        raise place.fail(f"all counts are equal ({lowest:g})", f"N0…N{last}", "these are not measurements")
-    return intensities, grid.points, list(remarks)[:1]
+    points, intensities, fine, remarks = cells_of(frames, path, np.isin(exposures.kind, ONE_CAMERA), cells)
+    what = f"{width} × {height} pixels of each exposure have become {len(points)} field points"
+    return (
+        intensities,
+        points,
+        fine,
+        [f"{path} [N0…N{frames.cameras - 1}]: {what}", *remarks, *_spots(fine, path)],
+    )
+
+
+def _spots(fine: FineStructure, path: Path) -> Iterator[str]:
+    """Remark on the places of the field at which pixels differ most from their surroundings."""
+    if len(spots := fine.spots):
+        (patch, camera), places = spots[0].tolist(), len(np.unique(spots[:, 0]))
+        gain = float(np.sqrt(fine.gain[patch, camera]))
+        where = f"near X = {fine.x[patch]:.4f}, Y = {fine.y[patch]:.4f} deg"
+        others = f"; and {places - 1} other place(s)" if places > 1 else ""
+        yield (
+            f"{path} [N{camera}]: pixels {where} differ by {100 * gain:.2g} % (rms) from their surroundings in all "
+            f"exposures{others}: dust, or a flat field that is left? q and u of stars there are off by up to half of "
+            "that (STRUCTURE of the set has a map)"
+        )
 
 
 NAME = "arrays"
@@ -338,7 +348,7 @@ def from_arrays(
     source: Any = None,
     sky: Any = None,
     origin: str = "",
-    compression: Compression | None = None,
+    fine: FineStructure | None = None,
     stated_errors: Mapping[str, float] | None = None,
     **exposures: Any,
 ) -> CalibrationSet:
@@ -351,8 +361,8 @@ def from_arrays(
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
     `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
     columns of SOURCES, `source` (point, exposure) the SOURCE of every intensity, −1 for none; `sky` the level of the
-    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name; `compression` is that
-    of a set that stands for whole frames; `stated_errors` are those of the numbers of the set that differ from the
+    sky that was subtracted from the counts, in their shape; `filters` are `FilterCurve`s by name; `fine` is that
+    of a set that was made of whole frames; `stated_errors` are those of the numbers of the set that differ from the
     usual ones, such as `{"position": 0.2, "scale": 1e-4}` (docs: files). Quantities are converted.
 
     Raises `DataError`, naming column and row, for whatever a file would be refused for.
@@ -406,14 +416,14 @@ def from_arrays(
     if filters:
         tables["FILTERS"] = filter_columns(filters)
     site = site or Site("", _NAN, _NAN, _NAN)
-    calset = _in_memory(tables, instrument=instrument, site=site, origin=origin, compression=compression)
+    calset = _in_memory(tables, instrument=instrument, site=site, origin=origin, fine=fine)
     stated = StatedErrors.of(stated_errors or {})
     return dataclasses.replace(calset, remarks=(*calset.remarks, *_spoilt(counts)), stated_errors=stated)
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
     """A set from memory behind the checks that files meet; unusable rows are masked, and remarked on."""
-    names = "instrument", "site", "origin", "compression", "stated_errors"
+    names = "instrument", "site", "origin", "fine", "stated_errors"
     header = {name: getattr(calset, name) for name in names}
     found = _in_memory(set_tables(calset), **header, kinds=(*KINDS, *kinds))
     before, after = calset.intensities, found.intensities

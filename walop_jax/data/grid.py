@@ -35,6 +35,10 @@ class Grid:
     def xy(self, start: int, stop: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """Return the field coordinates (degrees) of the points `start:stop`."""
         row, column = np.divmod(np.arange(start, stop), self.width)
+        return self.at(column, row)
+
+    def at(self, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the field coordinates (degrees) of places in the image, columns and rows counted from 0."""
         i, j = column + (1.0 - self.reference[0]), row + (1.0 - self.reference[1])
         (xi, xj), (yi, yj) = self.matrix
         return self.value[0] + (xi * i + xj * j), self.value[1] + (yi * i + yj * j)

@@ -23,7 +23,7 @@ from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
 
-_LOOKED_AT = 1024  # field points whose intensities are looked at; of frames, in evenly spaced runs
+_LOOKED_AT = 1024  # field points whose intensities are looked at; in evenly spaced runs
 FEW_ANGLES = 8
 """Angles of the polariser modulo 180° below which a set is in doubt."""
 _FEWEST_SETTINGS = 3
@@ -201,14 +201,16 @@ def inspect_files(
 
 
 def inspect(calset: CalibrationSet) -> Inspection:
-    """Look at a calibration set that has been read; of whole frames only at evenly spaced pixels."""
+    """Look at a calibration set that has been read; of many field points only at some, evenly spaced."""
     e, points = calset.exposures, calset.points
     _, block = sampled(calset.intensities, len(points), _LOOKED_AT)
     used = block.used
     share = used.mean(axis=0)
     live, measured = share > 0, used & ~e.flux_known
     counts, sigma = block.counts[measured], block.sigma[measured]
-    ratio = np.where(counts > 0, sigma**2 / np.where(counts > 0, counts, 1.0), np.nan)
+    # Errors of cells of whole frames are those of many pixels.
+    single = (counts > 0) & (calset.fine is None)
+    ratio = np.where(single, sigma**2 / np.where(single, counts, 1.0), np.nan)
     by_camera = np.array([_median(of_camera) for of_camera in ratio.T])
     angles = _distinct(np.mod(e.clp_angle[e.clp_in & live], 180.0))
     inspection = Inspection(
@@ -276,7 +278,7 @@ def _groups(calset: CalibrationSet, share: np.ndarray) -> tuple[Group, ...]:
 
 
 def _flags(calset: CalibrationSet) -> dict[str, int]:
-    """Flagged rows by meaning, for tables only: those of frames would have to be read entirely."""
+    """Flagged rows by meaning, of tables."""
     if not isinstance(calset.intensities, TableIntensities):
         return {}
     flag = calset.intensities.flag

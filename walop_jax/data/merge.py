@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
 
-from walop_jax.data.frames import FrameIntensities
-from walop_jax.data.grid import Grid
 from walop_jax.data.records import (
-    Block,
     CalibrationSet,
-    Compression,
     Exposures,
     FilterCurve,
-    Intensities,
+    FineStructure,
     Points,
     Position,
     Sources,
@@ -25,104 +20,32 @@ from walop_jax.data.records import (
 )
 from walop_jax.data.repeats import mask_repeats, repeated_counts
 from walop_jax.data.settings import same_filters
-from walop_jax.data.table_intensities import TableIntensities, empty_block
+from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.io.errors import DataError, fail
-
-
-class Part(NamedTuple):
-    """Intensities, their field points, and the rows that their exposures have in the whole."""
-
-    intensities: Intensities
-    points: Points
-    exposures: Int[np.ndarray, " r"]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class JoinedIntensities(Intensities):
-    """Parts with field points of their own, one after the other: frames, and a table beside them."""
-
-    parts: tuple[Part, ...]
-    exposures: int
-
-    @property
-    def cameras(self) -> int:
-        """Number of cameras, that of every part."""
-        return self.parts[0].intensities.cameras
-
-    @property
-    def rows(self) -> int:
-        """Number of used rows of all parts."""
-        return sum(part.intensities.rows for part in self.parts)
-
-    def block(self, start: int, stop: int) -> Block:
-        """Return the data of the field points `start:stop`, dense in the exposures."""
-        total = sum(len(part.points) for part in self.parts)
-        start, stop, _ = slice(start, stop).indices(total)
-        pieces = [empty_block(np.zeros(0), np.zeros(0), self.exposures, self.cameras)]
-        for part in self.parts:
-            piece = part.intensities.block(max(start, 0), max(stop, 0))
-            start, stop = start - len(part.points), stop - len(part.points)
-            dense = empty_block(piece.x, piece.y, self.exposures, self.cameras)
-            for name in ("counts", "sigma", "used", "source"):
-                getattr(dense, name)[:, part.exposures] = getattr(piece, name)
-            pieces.append(dense)
-        return Block.joined(pieces)
-
-
-def parts_of(calset: CalibrationSet) -> tuple[Part, ...]:
-    """The parts of a set with field points of their own, one where it has no others."""
-    intensities = calset.intensities
-    if isinstance(intensities, JoinedIntensities):
-        return intensities.parts
-    return (Part(intensities, calset.points, np.arange(len(calset.exposures))),)
-
-
-def frames_among(calset: CalibrationSet) -> tuple[FrameIntensities, Int[np.ndarray, " r"]] | None:
-    """The frames of a set and the exposures (positions) that they hold; None where there are none, or on two grids."""
-    parts = parts_of(calset)
-    frames = [(p.intensities, p.exposures) for p in parts if isinstance(p.intensities, FrameIntensities)]
-    return frames[0] if len(frames) == 1 else None
-
-
-def without_frames(calset: CalibrationSet) -> CalibrationSet | None:
-    """Part of a set beside its frames, with the exposures of all of it; None with no frames or nothing else."""
-    parts = parts_of(calset)
-    beside = tuple(part for part in parts if not isinstance(part.intensities, FrameIntensities))
-    if len(beside) in (0, len(parts)):
-        return None
-    intensities = JoinedIntensities(beside, len(calset.exposures))
-    return dataclasses.replace(calset, points=_stack_points(beside), intensities=intensities)
 
 
 def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
     """Join calibration sets of one instrument at one site.
 
-    Exposure and point identifiers that collide are renumbered (and this is remarked on); points of tables
-    with identical coordinates become one, sources with the same name likewise. Frames on the same
-    grid share their pixels; frames and tables keep field points of their own. A moving element that a set does
-    not have is out there. The record of a set that stands for pixels goes with its exposures. Of the errors of the
-    numbers of the sets the largest are taken.
+    Exposure and point identifiers that collide are renumbered (and this is remarked on); points with identical
+    coordinates become one, so that whole frames on the same grid share their points, and sources with the same name
+    likewise. A moving element that a set does not have is out there. Of the errors of the numbers of the sets the
+    largest are taken.
 
-    Raises `DataError` for different instruments, numbers of cameras or sites, for a filter or source that has
-    one name and two meanings, and for a set that stands for pixels beside another one, or beside frames.
+    Raises `DataError` for different instruments, numbers of cameras or sites, and for a filter or source that has
+    one name and two meanings.
     """
     first = sets[0]
     for calset in sets[1:]:
         _refuse_another_instrument(first, calset)
     exposures, remarks = _join_exposures(sets)
-    compression = _joined_record(sets, exposures)
     sources, source_rows = _join_sources(sets)
-    parts = _parts(sets, source_rows)
     names = ", ".join(str(entry_input.path) for entry in sets for entry_input in entry.inputs)
-    if len(parts) == 1:  # a whole of tables alone, or of frames alone, needs no joint
-        intensities, points, _ = parts[0]
-        if isinstance(intensities, TableIntensities):
-            intensities, repeated = mask_repeats(intensities, exposures, names)
-            remarks += repeated
-    else:
-        intensities = JoinedIntensities(tuple(parts), len(exposures))
-        points = _stack_points(parts)
-    remarks += repeated_counts(intensities, exposures, points, names, compression)
+    intensities, points = _join_tables(sets, source_rows)
+    intensities, repeated = mask_repeats(intensities, exposures, names)
+    remarks += repeated
+    structures = [entry.fine for entry in sets if entry.fine is not None]
+    remarks += repeated_counts(intensities, exposures, points, names)
     return CalibrationSet(
         instrument=first.instrument,
         site=first.site,
@@ -134,29 +57,9 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         intensities=intensities,
         inputs=tuple(entry_input for entry in sets for entry_input in entry.inputs),
         remarks=tuple(dict.fromkeys([remark for entry in sets for remark in entry.remarks] + remarks)),
-        compression=compression,
+        fine=FineStructure.joined(structures) if structures else None,
         stated_errors=StatedErrors.largest(entry.stated_errors for entry in sets),
     )
-
-
-def _joined_record(sets: tuple[CalibrationSet, ...], exposures: Exposures) -> Compression | None:
-    """The record of the one set that stands for pixels, with its exposures as they are numbered now."""
-    first = 0
-    record: Compression | None = None
-    for entry in sets:
-        rows, first = slice(first, first + len(entry.exposures)), first + len(entry.exposures)
-        if entry.compression is None:
-            continue
-        beside = [calset for calset in sets if calset is not entry]
-        if any(calset.compression is not None or frames_among(calset) for calset in beside):
-            what = "stands for pixels that were summed at one set of values; so do other sets here, or there are frames"
-            again = "walop-jax refit A.fits B.fits --compress SET.fits -o RUN"
-            raise _conflict(what, entry, "", f"compress the frames of all together: {again}")
-        record, numbers = entry.compression, exposures.exposure[rows]
-        if beside:
-            summed = numbers[record.covers(entry.exposures)]
-            record = dataclasses.replace(record, exposures=tuple(summed.tolist()))
-    return record
 
 
 def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> None:
@@ -170,30 +73,6 @@ def _refuse_another_instrument(first: CalibrationSet, other: CalibrationSet) -> 
     if not np.isclose(*places, rtol=0, atol=[1e-3, 1e-3, 10.0], equal_nan=True).all():
         what = f"is another site than that of {_name(first)}"
         raise _conflict(what, other, "SITELAT, SITELONG, SITEELEV")
-
-
-def _parts(sets: tuple[CalibrationSet, ...], source_rows: list[np.ndarray]) -> list[Part]:
-    """The parts of the whole: frames of every grid, then all tables."""
-    ends = np.cumsum([len(entry.exposures) for entry in sets])
-    rows = np.split(np.arange(ends[-1]), ends[:-1])
-    frames: dict[Grid, list[tuple[FrameIntensities, np.ndarray]]] = {}
-    tables: list[int] = []
-    for number, entry in enumerate(sets):
-        if isinstance(entry.intensities, FrameIntensities):
-            frames.setdefault(entry.intensities.grid, []).append((entry.intensities, rows[number]))
-        elif isinstance(entry.intensities, TableIntensities):
-            tables.append(number)
-        else:
-            raise _conflict("has been merged before", entry, "", "merge all files at once")
-    parts = []
-    for grid, members in frames.items():
-        stacks = tuple(stack for member, _ in members for stack in member.stacks)
-        places = np.concatenate([member_rows for _, member_rows in members])
-        parts.append(Part(FrameIntensities(grid, stacks), grid.points, places))
-    if tables:
-        table, points = _join_tables([sets[n] for n in tables], [source_rows[n] for n in tables])
-        parts.append(Part(table, points, np.concatenate([rows[n] for n in tables])))
-    return parts
 
 
 def _name(calset: CalibrationSet) -> str:
@@ -291,10 +170,10 @@ def _join_filters(sets: tuple[CalibrationSet, ...]) -> dict[str, FilterCurve]:
 
 
 def _join_tables(
-    sets: list[CalibrationSet], source_rows: list[np.ndarray]
+    sets: Sequence[CalibrationSet], source_rows: list[np.ndarray]
 ) -> tuple[TableIntensities, Points]:
     """Join tables of intensities; identical coordinates are one field point."""
-    tables = [entry.intensities for entry in sets if isinstance(entry.intensities, TableIntensities)]
+    tables = [TableIntensities.of(entry.intensities, entry.points) for entry in sets]
     points = [entry.points for entry in sets]
     # Two points of one file are never merged: both may have data in the same exposure.
     places = np.concatenate([np.column_stack([p.x, p.y, _earlier_ones(p)]) for p in points]) + 0.0  # −0 is 0
@@ -336,9 +215,3 @@ def _fresh(ids: np.ndarray) -> np.ndarray:
     fresh = ids.copy()
     fresh[repeated] = ids.max(initial=-1) + 1 + np.arange(len(repeated))
     return fresh
-
-
-def _stack_points(parts: Sequence[Part]) -> Points:
-    """The field points of some parts, one after the other."""
-    point, x, y = (np.concatenate([getattr(part.points, n) for part in parts]) for n in ("point", "x", "y"))
-    return Points(_fresh(point), x, y)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,9 @@ from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
 RUN = 64  # field points that are sampled together
+SPOT = 8.0  # standard errors from which a patch of the field holds structure of its own
+ROUNDING = 1e-10  # mean square gain of the rounding of numbers without noise
+FINE = 4.0  # standard errors from which the whole field holds some
 
 
 class DataFlag(enum.IntFlag):
@@ -405,35 +409,59 @@ class InputFile:
     sha256: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Compression:
-    """Origin of a calibration set made of whole frames: it stands for so many `pixels` of the files `frames`.
+@dataclasses.dataclass(frozen=True, eq=False)
+class FineStructure:
+    """Structure in whole frames that is finer than their cells, in patches of the field at `x`, `y` (degrees).
 
-    The pixels were summed at `values` of the model's parameters, where their χ² and its degrees of freedom were these.
-    `gain` and `response` are by how much single pixels differ there (`fit.verdict.Structure`); None: not computed.
-    `exposures` are those of the pixels, by their EXPOSURE, in a set that has others beside them; None: all are.
+    `gain` is the mean square, over the pixels of a patch, of the relative gain of a camera against its surroundings, as
+    far as exposures agree on it; chance makes it negative as well. `error` is its standard error without any structure.
+    Patches of several files stand one after the other.
     """
 
-    pixels: int
-    chi2: float
-    dof: int
-    values: Mapping[str, float]
-    frames: tuple[InputFile, ...] = ()
-    gain: float | None = None
-    response: float | None = None
-    exposures: tuple[int, ...] | None = None
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    gain: Float[np.ndarray, "n k"]
+    error: Float[np.ndarray, "n k"]
 
-    def covers(self, exposures: Exposures) -> Bool[np.ndarray, " e"]:
-        """True for the exposures whose pixels were summed."""
-        return np.isin(exposures.exposure, exposures.exposure if self.exposures is None else self.exposures)
+    @classmethod
+    def joined(cls, parts: Sequence[FineStructure]) -> FineStructure:
+        """The patches of several files."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    @functools.cached_property
+    def _usual(self) -> tuple[float, float]:
+        """Mean square gain of patches without spots, and its standard error."""
+        deviate = self.gain / self.error
+        middle = float(np.median(deviate)) if deviate.size else 0.0
+        spread = max(1.0, 1.4826 * float(np.median(np.abs(deviate - middle)))) if deviate.size else 1.0
+        weight = np.where(np.abs(deviate - middle) < SPOT * spread, self.error**-2.0, 0.0)
+        total = float(weight.sum())
+        return (
+            (float(np.sum(weight * self.gain)) / total, spread * total**-0.5) if total > 0 else (0.0, np.inf)
+        )
+
+    @property
+    def everywhere(self) -> float:
+        """Rms gain of the pixels of the whole field, spots left out; 0 where noise makes as much."""
+        mean, error = self._usual
+        return float(np.sqrt(mean)) if mean > FINE * error else 0.0
+
+    @property
+    def spots(self) -> Int[np.ndarray, "s 2"]:
+        """Patches (row) and cameras that have far more than the field usually has, the clearest first."""
+        mean, _ = self._usual
+        deviate = (self.gain - max(mean, 0.0)) / self.error
+        found = np.argwhere((deviate > SPOT) & (self.gain > ROUNDING))
+        return found[np.argsort(-deviate[tuple(found.T)])]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrationSet(Displayed):
     """A calibration set, read, checked and free of units.
 
-    `intensities` gives the data of a slice of the points; whole frames are read from disk only then. `compression` is
-    there where the field points stand for the pixels of frames. `stated_errors` are those of the numbers of the set.
+    `intensities` gives the data of a slice of the points. `fine` is the structure that is finer than the cells of whole
+    frames, in a set that was made of these. `stated_errors` are those of the numbers of the set.
 
     >>> calset.instrument, len(calset.exposures), len(calset.points)
     ('WALOP-SOUTH', 14, 29)
@@ -449,7 +477,7 @@ class CalibrationSet(Displayed):
     intensities: Intensities
     inputs: tuple[InputFile, ...] = ()
     remarks: tuple[str, ...] = ()
-    compression: Compression | None = None
+    fine: FineStructure | None = None
     stated_errors: StatedErrors = StatedErrors()
 
     @property
@@ -458,7 +486,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """Summary of the observations, without reading frames."""
+        """Summary of the observations."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         x, y = (f"{values.min():+.3f} … {values.max():+.3f}°" for values in (points.x, points.y))
@@ -475,8 +503,7 @@ class CalibrationSet(Displayed):
     def to_arrays(self) -> dict[str, Any]:
         """The set as arrays: `from_arrays(**calset.to_arrays())` is the same set; NaN where nothing was measured.
 
-        `counts` and `errors` (point, exposure, camera) are electrons, `x`, `y` and `angles` degrees. Of whole frames
-        give a part at a time: `intensities.block(start, stop)`.
+        `counts` and `errors` (point, exposure, camera) are electrons, `x`, `y` and `angles` degrees.
 
         >>> arrays = calset.to_arrays()
         >>> arrays["counts"].shape == (len(calset.points), len(calset.exposures), calset.cameras)
@@ -505,7 +532,7 @@ class CalibrationSet(Displayed):
             "filters": dict(self.filters),
             "sources": stars if len(self.sources) else None,
             "origin": self.origin,
-            "compression": self.compression,
+            "fine": self.fine,
             "stated_errors": self.stated_errors.stated,
         }
 
@@ -519,7 +546,7 @@ class CalibrationSet(Displayed):
 
 
 class Intensities:
-    """The intensities of every (exposure, point): a table in memory or frames on disk.
+    """The intensities of every (exposure, point): a table, or any other source.
 
     `block` must be pure and may be called from several threads; the field points it counts in are those
     of `CalibrationSet.points`, the exposures those of `CalibrationSet.exposures`.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int
 
-from walop_jax.data.records import Compression, Exposures, Intensities, Points, sampled
+from walop_jax.data.records import Exposures, Intensities, Points, sampled
 from walop_jax.data.units import Place
 from walop_jax.io.text import some
 
@@ -68,17 +68,14 @@ def repeated_counts(
     exposures: Exposures,
     points: Points,
     file: object,
-    compression: Compression | None = None,
 ) -> Iterator[str]:
     """Remark on exposures, or field points, most of whose rows have the counts of another row at the same place.
 
     Counts agree where they do in single precision, whatever times and identifiers they have. Noise does not repeat in
-    all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out, and
-    those whose pixels were summed. Of large sets, and of frames, a sample of the points is looked at.
+    all cameras; expected counts without noise may. Exposures of known flux, which may be exact, are left out.
+    Of large sets a sample of the points is looked at.
     """
     counted = ~exposures.flux_known
-    if compression is not None:
-        counted &= ~compression.covers(exposures)
     if not counted.any():
         return
     places, block = sampled(intensities, len(points), _LOOKED_AT)

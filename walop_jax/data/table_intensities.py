@@ -19,7 +19,7 @@ ONE_CAMERA = [name for name, kind in KINDS.items() if kind.flux_known or kind.fl
 NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
-_SPOILT = 0.2
+SPOILT = 0.2
 """Above this share of unusable rows the set is refused, not masked."""
 
 
@@ -192,7 +192,7 @@ def _sky(table: dict[str, Any], place: Place) -> Float[np.ndarray, "r k"] | None
 def _judge(counts: np.ndarray, used: np.ndarray, spoilt: np.ndarray, place: Place) -> list[str]:
     """Refuse data that cannot be measurements; remark on masked rows."""
     bad = np.flatnonzero(spoilt)
-    if len(bad) > _SPOILT * len(spoilt):
+    if len(bad) > SPOILT * len(spoilt):
         cameras = [f"N[{k}]" for k in range(counts.shape[1]) if not np.any(np.isfinite(counts[:, k]))]
         empty = f", no data at all in {', '.join(cameras)}" if cameras else ""
         what = f"{100 * len(bad) / len(spoilt):.0f} % of the rows are not finite or far below zero"

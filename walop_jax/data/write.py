@@ -1,12 +1,10 @@
 """Writing calibration sets as tables.
 
-The extension COMPRESSION describes the whole frames for whose pixels a calibration set stands
-(docs: files).
+The extension STRUCTURE is that of a set that was made of whole frames: structure finer than its points (docs: files).
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -16,86 +14,42 @@ from astropy.io import fits
 from walop_jax.data import schema
 from walop_jax.data.checks import instrument_name
 from walop_jax.data.hdus import check_ascii, filter_columns, set_table_hdu, sign_and_write, table_hdu
-from walop_jax.data.records import ERROR_WORDS, CalibrationSet, Compression, InputFile
+from walop_jax.data.records import ERROR_WORDS, CalibrationSet, FineStructure
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.data.units import Place
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import PathLike
 
-EXTENSION, _AGAIN = "COMPRESSION", "compress the frames again"
-MOST_EXPOSURES = 1_000_000  # of a run that a header may claim
+STRUCTURE = "STRUCTURE"
+_RULES = {
+    "X": schema.Column("float", "deg"),
+    "Y": schema.Column("float", "deg"),
+    "GAIN2": schema.Column("float"),
+    "GAIN2_ERR": schema.Column("float"),
+}
 
 
-def compression_hdu(found: Compression, path: object) -> fits.BinTableHDU:
-    """The extension of a record."""
-    columns = {"NAME": np.array(list(found.values), "U"), "VALUE": np.array(list(found.values.values()))}
-    rules = {"NAME": schema.Column("str"), "VALUE": schema.Column("float")}
-    hdu = table_hdu(EXTENSION, columns, path, rules)
-    hdu.header["NPIXELS"] = (found.pixels, "pixels that the field points stand for")
-    hdu.header["CHI2"] = (found.chi2, "chi-square of the pixels at these values")
-    hdu.header["DOF"] = (found.dof, "its degrees of freedom")
-    if found.gain is not None and found.response is not None:
-        hdu.header["STRUCTG"] = (found.gain, "rms gain of a camera at a pixel")
-        hdu.header["STRUCTR"] = (found.response, "rms response of a camera to q, u there")
-    if found.exposures is not None:
-        ordered = np.unique(np.array([*found.exposures], int))
-        runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-        hdu.header["EXPOSURE"] = ",".join(f"{run[0]}:{run[-1]}" for run in runs if len(run))
-    for number, entry in enumerate(found.frames, start=1):
-        hdu.header[f"FILE{number}"] = str(entry.path.name)
-        hdu.header[f"SHA{number}"] = entry.sha256
-    return hdu
+def _structure_hdu(found: FineStructure, path: object) -> fits.BinTableHDU:
+    """The extension of the structure of whole frames."""
+    columns = {"X": found.x, "Y": found.y, "GAIN2": found.gain, "GAIN2_ERR": found.error}
+    return table_hdu(STRUCTURE, columns, path, _RULES)
 
 
-def read_compression(hdu: Any, path: Path) -> Compression:
-    """The record of an extension; `DataError` for one that lacks something."""
-    place, header = Place(path, EXTENSION), hdu.header
-    for name in ("NPIXELS", "CHI2", "DOF"):
-        if _asked(header, name) is None:
-            raise place.fail("is missing or no number", name, _AGAIN)
+def read_structure(hdu: Any, cameras: int, path: Path) -> FineStructure:
+    """The structure of whole frames of an extension; `DataError` for one that lacks something."""
+    place, again = Place(path, STRUCTURE), "write the set again, from the frames"
     names = [name.upper() for name in getattr(getattr(hdu, "columns", None), "names", [])]
-    if sorted(names) != ["NAME", "VALUE"]:
-        raise place.fail("has not the columns NAME and VALUE", advice=_AGAIN)
-    values = np.asarray(hdu.data["VALUE"], float)
-    if not np.isfinite(values).all():
-        raise place.fail("is not finite", "VALUE", _AGAIN)
-    frames = []
-    while f"SHA{len(frames) + 1}" in header:
-        number = len(frames) + 1
-        frames.append(InputFile(Path(str(header.get(f"FILE{number}", ""))), str(header[f"SHA{number}"])))
-    by_name = zip(hdu.data["NAME"], values.tolist(), strict=True)
-    return Compression(
-        pixels=int(header["NPIXELS"]),
-        chi2=float(header["CHI2"]),
-        dof=int(header["DOF"]),
-        values={str(name).strip(): value for name, value in by_name},
-        frames=tuple(frames),
-        gain=_asked(header, "STRUCTG"),
-        response=_asked(header, "STRUCTR"),
-        exposures=None if "EXPOSURE" not in header else _of_runs(header["EXPOSURE"], place),
-    )
-
-
-def _of_runs(text: object, place: Place) -> tuple[int, ...]:
-    """The whole numbers of runs, "0:23,40:41"; `DataError` for texts that are none."""
-    runs = [re.fullmatch(r"(-?\d{1,18}):(-?\d{1,18})", run) for run in str(text).strip().split(",")]
-    ends = [(int(run[1]), int(run[2])) for run in runs if run]
-    if len(ends) < len(runs) or any(not 0 <= last - first < MOST_EXPOSURES for first, last in ends):
-        raise place.fail(f"is {text!r}, not runs of numbers like 0:23", "EXPOSURE", _AGAIN)
-    return tuple(number for first, last in ends for number in range(first, last + 1))
-
-
-def _asked(header: Any, name: str) -> float | None:
-    """A number of the header; None where it is missing."""
-    value = header.get(name)
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def remark(found: Compression, points: int) -> str:
-    """Caution about a set that stands for pixels."""
-    what = f"{points} field points stand for {found.pixels:,} pixels, of which χ²/dof was"
-    ratio = found.chi2 / max(found.dof, 1)
-    return f"{what} {ratio:.5g}: structure below a twentieth of the field is not seen here"
+    if missing := [name for name in _RULES if name not in names]:
+        raise place.fail(f"has no column {missing[0]}", advice=again)
+    x, y, gain, error = (np.asarray(hdu.data[name], float) for name in _RULES)
+    if not gain.shape == error.shape == (len(x), cameras):
+        what = f"has values of shape {gain.shape}, errors of {error.shape}, for {len(x)} places and {cameras} cameras"
+        raise place.fail(what, "GAIN2", again)
+    if not (np.isfinite([x, y]).all() and np.isfinite([gain, error]).all() and (error > 0).all()):
+        raise place.fail(
+            "holds numbers that are not finite, or errors that are not positive", "GAIN2_ERR", again
+        )
+    return FineStructure(x, y, gain, error)
 
 
 # -------------------------------------------------------------------------------------------------- tables
@@ -104,8 +58,8 @@ def remark(found: Compression, points: int) -> str:
 def write_calibration_set(path: PathLike, calset: CalibrationSet, *, overwrite: bool = False) -> None:
     """Write a calibration set as tables, with checksums; the file appears whole or not at all.
 
-    Data that were read come back bit for bit, rows that are not used included; other intensities (frames, say)
-    are written as their used rows. The bytes depend on the set alone, not on the day.
+    Data that were read come back bit for bit, rows that are not used included; other intensities are
+    written as their used rows. The bytes depend on the set alone, not on the day.
 
     Raises `DataError` if the file exists and `overwrite` is False, if the folder is missing or read-only,
     and if a name cannot be written in FITS (ASCII only).
@@ -115,8 +69,8 @@ def write_calibration_set(path: PathLike, calset: CalibrationSet, *, overwrite: 
     with atomic_path(path, overwrite=overwrite) as temporary:
         tables = set_tables(calset).items()
         hdus: list[Any] = [_primary(calset, path), *(set_table_hdu(*table, path) for table in tables)]
-        if calset.compression is not None:
-            hdus.append(compression_hdu(calset.compression, path))
+        if calset.fine is not None:
+            hdus.append(_structure_hdu(calset.fine, path))
         sign_and_write(hdus, temporary)
 
 

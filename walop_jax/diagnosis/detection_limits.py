@@ -51,7 +51,6 @@ from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separa
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.stand_in import on_field_points
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
@@ -310,7 +309,7 @@ def detection_limits(
     template, calset = result.model.template, result.calset
     catalogue = known_effects(result.model) if catalogue is None else catalogue
     listed = hypotheses(catalogue, template, calset.exposures, len(calset.points))
-    result = sampled(on_field_points(result), most_points(calset, template, listed.amplitudes))
+    result = sampled(result, most_points(calset, template, listed.amplitudes))
     tell(Stage("differentiating every effect", "differentiating"))
     rng = np.random.default_rng(seed)
     examination = examine(result, listed, rng)

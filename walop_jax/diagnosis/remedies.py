@@ -99,7 +99,7 @@ def _of_rows(result: FitResult) -> Iterator[Remedy]:
         return
     try:
         found = clipped(result.calset, result.model)
-    except DataError:  # too many to be single ones, or rows that stand for pixels
+    except DataError:  # too many to be single ones
         return
     left_out = found.clipped
     if left_out is None or not (found.explains_data or found.nearly_explains_data) or found.noise_scale > 1.0:

@@ -23,8 +23,8 @@ Symbols     w = expected counts / errors of all with a flux in common (an exposu
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
-Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a sample of the points is looked at, of
-            whole frames the points that stand for all pixels: finer structure shows in χ² and in the residual map.
+Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a sample of the points is looked at.
+            What is finer than the cells of whole frames was measured when these were read (`data.cells`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
-from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
 from walop_jax.diagnosis.discrete import refuse_mixups
@@ -49,7 +48,6 @@ from walop_jax.diagnosis.remedies import remedies
 from walop_jax.diagnosis.score import Blocks, Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
 from walop_jax.diagnosis.variance_components import (
-    VarianceComponent,
     found_components,
     in_words,
     repeated_noise,
@@ -59,13 +57,8 @@ from walop_jax.diagnosis.variance_components import (
 )
 from walop_jax.fit.refit import FitResult, with_honest_errors
 from walop_jax.fit.search import FAR_OFF
-from walop_jax.fit.stand_in import FARTHEST, moved, on_field_points, with_pixel_structure, with_pixels
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
-from walop_jax.io.errors import fail
-from walop_jax.io.names import IN_MEMORY
 from walop_jax.io.text import beside, some
-from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelExpansion
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import known_effects
@@ -100,7 +93,6 @@ def examined(
     explains.
     """
     refuse_dead_cameras(result)
-    result = with_pixels(result)
     if not result.converged:
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
             refuse_mixups(result)
@@ -108,16 +100,14 @@ def examined(
     near = result.explains_data or result.nearly_explains_data
     if not (near or as_written):
         refuse_mixups(result)
-    field_fit = on_field_points(result)
-    seen = sampled(field_fit)
+    seen = sampled(result)
     cures = () if near else _remedies(result, seen, seed)
     if cures:
         return result.judged(remedies=cures)
     design = Design.of(seen)
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
-    pixels = _of_pixels(result)
-    components = found_components([*pixels, *variance_components(design)])
+    components = found_components(variance_components(design))
     hidden = singles = None
     if near:
         singles = Singles.of(design)
@@ -140,13 +130,12 @@ def examined(
     else:  # anything may be in such residuals; what single places of the field share sits on stars as well
         components = [component for component in components if component.grouping.structure]
         doubts = (*stated_conditions(design), *in_words(components))
-    doubts = (*doubts, *_summed_pixels(result), *_far_from_pixels(result))
+    doubts = (*doubts, *_finer(result))
     structure = structure_of(components)
     final = with_honest_errors(result)
     if structure:
-        of_points = [component for component in components if not any(component is pixel for pixel in pixels)]
-        final = with_structure(final, design, of_points, len(field_fit.calset.points))
-    final = final.judged(doubts, structure=_with_summed_pixels(result, structure))
+        final = with_structure(final, design, components, len(result.calset.points))
+    final = final.judged(doubts, structure=_with_finer(result, structure))
     if unseen := hidden.not_measured() if hidden is not None else ():
         final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
     for what in singles.of_noise if singles is not None else ():
@@ -230,57 +219,24 @@ def _in_groups(probes: Sequence[Probe], amplitudes: float) -> Iterator[list[Prob
         yield [probe for _, probe in group]
 
 
-def _of_pixels(result: FitResult) -> list[VarianceComponent]:
-    """Variance components common to exposures in single pixels of whole frames, of a sample of them."""
-    pixels = isinstance(result.expansion, PixelExpansion)
-    return variance_components(Design.of(sampled(result)), pixels=True) if pixels else []
-
-
-def _summed_pixels(result: FitResult) -> Iterator[str]:
-    """Findings in the pixels that a set stands for, when they were summed."""
-    compression = result.calset.compression
-    if compression is None:
-        return
-    if compression.gain is None and not result.explains_data:
+def _finer(result: FitResult) -> Iterator[str]:
+    """Structure finer than the cells of whole frames, all over the field."""
+    if (fine := result.calset.fine) is not None and fine.everywhere:
         yield (
-            f"χ² of the {compression.pixels} summed pixels lies {result.excess:.3g} standard deviations above its "
-            "expectation, and the cause was not searched for: compress the frames again"
-        )
-    elif compression.gain or compression.response:
-        yield (
-            "residuals of the same pixel agreed between exposures when the pixels were summed: structure of "
-            f"{max(compression.gain or 0.0, compression.response or 0.0):.2g} that the model does not have"
+            f"residuals of the same pixel agree between exposures: structure of {fine.everywhere:.2g}, finer than the "
+            "cells of the frames, that the model does not have"
         )
 
 
-def _with_summed_pixels(result: FitResult, structure: Structure) -> Structure:
-    """The structure of field points with that of the pixels that they stand for."""
-    if (compression := result.calset.compression) is None:
-        return structure
-    gain, response = compression.gain or 0.0, compression.response or 0.0
-    return Structure(float(np.hypot(structure.gain, gain)), float(np.hypot(structure.response, response)))
-
-
-def pixel_structure(result: FitResult) -> Structure:
-    """By how much single pixels of whole frames differ beyond the model of a fit."""
-    return structure_of(found_components(_of_pixels(result)))
-
-
-def stand_in(result: FitResult) -> CalibrationSet:
-    """The set of some hundred field points that stands for whole frames. Raises `DataError` for other data."""
-    if not isinstance(result.expansion, PixelExpansion):
-        where = result.calset.inputs[0].path if result.calset.inputs else IN_MEMORY
-        advice = (
-            "only whole frames of many pixels can, under a model that is smooth over the field, with detectors that "
-            "report counts as they are; tables and small frames are small enough as they are"
-        )
-        raise fail("cannot be compressed", file=where, advice=advice)
-    return with_pixel_structure(compressed(result.expansion), pixel_structure(result))
+def _with_finer(result: FitResult, structure: Structure) -> Structure:
+    """The structure of field points with that of the pixels in their cells."""
+    fine = 0.0 if result.calset.fine is None else result.calset.fine.everywhere
+    return dataclasses.replace(structure, gain=float(np.hypot(structure.gain, fine)))
 
 
 def _remedies(result: FitResult, seen: FitResult, seed: int) -> tuple[str, ...]:
     """What would turn the residuals of a fit into noise, the best remedy first; `seen` are its field points."""
-    rough = any(_summed_pixels(result)) or any(found_components(_of_pixels(result)))
+    rough = any(_finer(result))
 
     def is_noise(fitted: FitResult) -> bool:
         design = Design.of(fitted)
@@ -289,16 +245,6 @@ def _remedies(result: FitResult, seen: FitResult, seed: int) -> tuple[str, ...]:
         return pattern_scores(design, seed).p_global >= thresholds.ALARM
 
     return remedies(seen, is_noise)
-
-
-def _far_from_pixels(result: FitResult) -> Iterator[str]:
-    """A warning if the values have left the place where the pixels that a set stands for were summed."""
-    distance = moved(result)
-    if distance > FARTHEST:
-        yield (
-            f"the fit lies {distance:.3g} standard errors from where the pixels were summed, some "
-            f"{distance / 1000:.1g} of which may be left: compress the frames again, with this model"
-        )
 
 
 def _hold_no_noise(design: Design) -> bool:

@@ -16,7 +16,7 @@ that with B = QᵀA and D what the fluxes leave of AᵀA, block by block,
     tr G = tr D − tr M,   tr G² = |D|² − 2 tr BDBᵀ + |M|²,   tr G³ = tr D³ − 3 tr BD²Bᵀ + 3 tr BDBᵀM − tr M³,  M = BBᵀ.
 
 Groupings   the gain of each camera, and its response to each Stokes parameter, at each field point (structure finer
-            than any polynomial: flat fields, dust, pixels); its gain and gradients over the field in each exposure;
+            than any polynomial: flat fields, dust); its gain and gradients over the field in each exposure;
             its response to each Stokes parameter in each state of the moving elements; its gain and gradients for
             each night and kind of exposure; its gain and response to each Stokes parameter for each standard. A gain
             multiplies the counts of an exposure; a response adds light, as a change of an analysis vector does
@@ -92,11 +92,11 @@ class VarianceComponent(NamedTuple):
     error: float
 
 
-def variance_components(design: Design, *, pixels: bool = False) -> list[VarianceComponent]:
-    """Every grouping that the data have, asked by itself; of single `pixels` those of field points alone."""
+def variance_components(design: Design) -> list[VarianceComponent]:
+    """Every grouping that the data have, asked by itself."""
     residual = design.projector(design.residual)
     square = float(residual @ residual)
-    grouped = groupings(design, pixels=pixels) if square > 0 else ()
+    grouped = groupings(design) if square > 0 else ()
     ready = (asked(design, grouping, residual[:, None]) for grouping in grouped)
     return [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
 
@@ -153,7 +153,7 @@ def with_structure(
     )
 
 
-def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
+def groupings(design: Design) -> Iterator[_Grouping]:
     """The groupings that the data have; of two that cut them alike, the first."""
     measured, calset = design.measured, design.fit.calset
     e, points, used = calset.exposures, calset.points, measured.used
@@ -162,18 +162,15 @@ def groupings(design: Design, *, pixels: bool = False) -> Iterator[_Grouping]:
     reach = max(float(np.hypot(points.x, points.y).max(initial=0.0)), 1e-12)
     plane = np.stack([np.ones(len(points)), points.x / reach, points.y / reach], axis=-1)
     plane = np.broadcast_to(plane[:, None], (*used.shape, 3))
-    point = "pixel" if pixels else "field point"
-    agree = f"of the same {point} agree between exposures"
+    agree = "of the same field point agree between exposures"
     stride = -(-used.shape[0] // MOST_PLACES)
     number = np.arange(used.shape[0])
     at_points = np.where(number % stride == 0, number // stride, -1)[:, None]
     at_points = np.broadcast_to(at_points, used.shape)
     if used.shape[0] > 1:
-        yield _Grouping(f"{point}s", agree, at_points, constant, nothing, "gain")
+        yield _Grouping("field points", agree, at_points, constant, nothing, "gain")
         agree_in_qu = f"{agree} in q and u"
-        yield _Grouping(f"{point}s in q and u", agree_in_qu, at_points, nothing, stokes, "response")
-    if pixels:
-        return
+        yield _Grouping("field points in q and u", agree_in_qu, at_points, nothing, stokes, "response")
     moving = map(e.position, design.fit.likelihood.plan.moving)
     positions = [np.where(at.inside, at.angle, np.nan) for at in moving]
     night = night_of(e.mjd, calset.site.longitude)

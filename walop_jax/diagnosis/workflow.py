@@ -41,10 +41,9 @@ from walop_jax.diagnosis.remainder import (
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
-from walop_jax.diagnosis.trust import examined, pixel_structure
+from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, with_honest_errors
-from walop_jax.fit.stand_in import in_field_points
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
@@ -79,7 +78,6 @@ def diagnose(
     tell = progress or (lambda text: None)
     model = model or base_model(calset)
     catalogue = known_effects(model) if catalogue is None else catalogue
-    calset = in_field_points(calset, model, tell, pixel_structure)
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
     sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)
     if len(sample.points) < len(calset.points):

@@ -7,7 +7,6 @@ and where every arm has a flux of its own, the whole series of the first one is:
 from __future__ import annotations
 
 from walop_jax.data.kinds import POLARISER
-from walop_jax.data.merge import parts_of
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.instruments.description import shipped
@@ -76,13 +75,12 @@ def _level(calset: CalibrationSet) -> float:
 
     A camera gets half of the unpolarised light: N = T/2.
     """
-    for subset, points, exposures in parts_of(calset):
-        stated = calset.exposures.flux_known[exposures]
-        for start in range(0, len(points) if stated.any() else 0, LEVEL_POINTS):
-            block = subset.block(start, min(start + LEVEL_POINTS, len(points)))
-            counts = block.counts[block.used & stated]
-            if counts.size:
-                return float(2.0 * counts.mean())
+    stated, points = calset.exposures.flux_known, len(calset.points)
+    for start in range(0, points if stated.any() else 0, LEVEL_POINTS):
+        block = calset.intensities.block(start, min(start + LEVEL_POINTS, points))
+        counts = block.counts[block.used & stated]
+        if counts.size:
+            return float(2.0 * counts.mean())
     return LEVEL
 
 

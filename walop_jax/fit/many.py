@@ -156,8 +156,8 @@ def refit_many(
 
     >>> walop.refit_many(realisations).to_table()["NAME", "SCATTER", "ERROR"]  # doctest: +SKIP
 
-    Raises `DataError` for no sets, for a set of another layout than the first one (with its position), and for whole
-    frames; ValueError where exposures cannot determine the instrument.
+    Raises `DataError` for no sets, for a set of another layout than the first one (with its position), and for sets
+    whose optics are interpolated; ValueError where exposures cannot determine the instrument.
     """
     began = time.perf_counter()
     if not calsets:
@@ -318,7 +318,7 @@ def _likelihoods(calsets: Sequence[CalibrationSet], given: Model | None) -> list
     first = Likelihood.of(calsets[0], model)
     if first.layout.interpolated:
         what = f"set 0 has {first.layout.points} field points"
-        raise fail(what, advice="whole frames are fitted one by one: walop.refit")
+        raise fail(what, advice="so large sets are fitted one by one: walop.refit")
     needs_no_counts = first.plan.exposures.median_counts is None  # else every set has a plan of its own
     likelihoods = [first]
     for n, calset in enumerate(calsets[1:], start=1):

@@ -46,16 +46,16 @@ def clipped(calset: CalibrationSet, model: Model | None = None, beyond: float = 
     errors are taken as large as the residuals. Where all rows lie off alike none goes: that is for
     `FitResult.warnings` to say.
 
-    Raises ValueError for `beyond` below `LEAST`, `DataError` for frames, for compressed sets, and where more than
-    `MOST` of the rows lie off: then the model lacks something. Raises what `fit` raises.
+    Raises ValueError for `beyond` below `LEAST`, `DataError` for intensities that are no table, and where more
+    than `MOST` of the rows lie off: then the model lacks something. Raises what `fit` raises.
     """
     if not beyond >= LEAST:
         raise ValueError(
             f"clip: {beyond:g} standard errors: noise itself lies so far off; at least {LEAST:g}"
         )
     where = calset.inputs[0].path if calset.inputs else IN_MEMORY
-    if not isinstance(calset.intensities, TableIntensities) or calset.compression is not None:
-        advice = "only tables of intensities can; of frames the reduction flags cosmic rays, in FLAG"
+    if not isinstance(calset.intensities, TableIntensities):
+        advice = "only tables of intensities can"
         raise fail("cannot be clipped", file=where, advice=advice)
     model, whole = model or base_model(calset), calset
     table, values = calset.intensities, model.start

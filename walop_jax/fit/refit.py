@@ -284,7 +284,7 @@ def fit(
     Raises ValueError when the exposures cannot determine the instrument.
     """
     began = time.perf_counter()
-    first = _start(likelihood) if start is None else np.asarray(start, float)
+    first = likelihood.model.start if start is None else np.asarray(start, float)
     # Where errors of the data have parameters, the instrument is sought first, with errors held.
     likelihood = likelihood.with_errors_at(first)
     best = find_minimum(likelihood, first, noise_scale, worth)
@@ -318,14 +318,6 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
         minimum=best,
         seconds=seconds,
     )
-
-
-def _start(likelihood: Likelihood) -> Vector:
-    """The start values of the model; of a set that stands for pixels, the values at which these were summed."""
-    model, compression = likelihood.model, likelihood.calset.compression
-    values = {} if compression is None else compression.values
-    x = [values.get(model.names[i], model.start[i]) for i in model.free]
-    return model.full(np.array(x))
 
 
 def with_honest_errors(result: FitResult) -> FitResult:
@@ -414,15 +406,13 @@ def refit(
     model: Model | None = None,
     *,
     progress: Progress | None = None,
-    memory: float | None = None,
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 
-    `progress` is called with a line about each step; `memory` (bytes, default 2 GB) is the limit for the data of
-    the points. Errors are those of `with_honest_errors`. Raises what `fit` raises.
+    `progress` is called with a line about each step. Errors are those of `with_honest_errors`. Raises what `fit`
+    raises.
     """
     runner = Runner(progress=progress)
-    likelihood = Likelihood.of(calset, model or base_model(calset), memory=memory, runner=runner)
-    size = likelihood.layout.memory / 1e9
-    runner.tell(Stage(f"preparing the fit{f' of {size:.2g} GB of data' if size > 0.1 else ''}", "fitting"))
+    likelihood = Likelihood.of(calset, model or base_model(calset), runner=runner)
+    runner.tell(Stage("preparing the fit", "fitting"))
     return with_honest_errors(fit(likelihood))

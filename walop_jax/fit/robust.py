@@ -23,11 +23,10 @@ from jaxtyping import Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.search import free_scales
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.compressed import compressed
-from walop_jax.likelihood.frames import PixelExpansion, Vector
 from walop_jax.likelihood.inverses import root_of
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Expansion, Likelihood, Matrix
+from walop_jax.model.specification import Vector
 
 ROBUST_POINTS = 4096
 """Field points whose residuals give the errors of a fit that does not explain its data."""
@@ -42,8 +41,7 @@ def robust_errors(
     """Covariance of the free parameters from the residuals at a minimum, and its origin in words.
 
     `expansion` is the expansion there, `values` a full vector.
-    Of whole frames the blocks are those of the field points that stand for all pixels; of another large set those of
-    a sample of its points, as if the others had residuals like them.
+    Of a large set the blocks are those of a sample of its points, as if the others had residuals like them.
     """
     rows = likelihood.priors
     model, scale = likelihood.model, expansion.noise_scale
@@ -56,8 +54,6 @@ def robust_errors(
     independent = (expansion.matrix - prior) * square / scale**2 + prior
     covariance = bread @ (independent * np.outer(unit, unit)) @ bread
     ways = []
-    if isinstance(expansion, PixelExpansion):
-        likelihood = Likelihood.of(compressed(expansion), model, interpolate=False)
     for name, gradients in _gradients(likelihood, values):
         count = len(gradients)
         if count < FEWEST_BLOCKS:

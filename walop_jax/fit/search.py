@@ -8,7 +8,7 @@ Every search ends: a model that is far from the data (χ²/dof above `FAR_OFF`) 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,20 +16,12 @@ import numpy as np
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.frames import expand_pixels, stands_for_pixels, strips_of
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
 from walop_jax.model import materials
 from walop_jax.model.noise import NOISE
 from walop_jax.model.specification import Model, Vector
 
-FIRST_STRIPS = 8
-"""Strips of image rows that are fitted before all of them: twice the need of a throughput of fourth order."""
-
-PIXEL_SAMPLE = 1024
-"""Pixels of whole frames on which their fit begins: the optics of so few are soon solved one by one."""
-
-Expand = Callable[[Vector, float, Expansion | None], Expansion]
 Found = Minimum[Expansion]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
@@ -57,19 +49,18 @@ def _search(
     first: Vector,
     noise_scale: float,
     near: Expansion | None = None,
-    expand: Expand | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
 ) -> Found:
     """The minimum from a full vector of start values, its `x` full as well; `near` is an expansion at similar ones.
 
-    `expand` takes the place of `Likelihood.expand`; `how` goes to `minimise`.
+    `how` goes to `minimise`.
     """
-    expand, model = expand or likelihood.expand, likelihood.model
+    model = likelihood.model
 
     def evaluate(x: Vector) -> Expansion:
         nonlocal near
-        near = expand(model.full(x, first), noise_scale, near)
+        near = likelihood.expand(model.full(x, first), noise_scale, near)
         return near
 
     def tell(step: int, best: Expansion) -> None:
@@ -127,31 +118,19 @@ def find_minimum(
 ) -> Found:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    The sample of a very large set is large itself. Of whole frames some strips of image rows come between the sample
-    and all pixels. `noise_scale` and `worth` are those of `refit.fit`. Raises `DataError` when the exposures cannot
-    determine the instrument.
+    The sample of a very large set is large itself. `noise_scale` and `worth` are those of `refit.fit`. Raises
+    `DataError` when the exposures cannot determine the instrument.
     """
     layout = likelihood.layout
     if not layout.large:
         return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, worth))
-    on_pixels = stands_for_pixels(likelihood, first)
-    points = PIXEL_SAMPLE if on_pixels else max(limits.SAMPLE, layout.points // limits.FARTHEST)
-    sample_set, runner = thinned(likelihood.calset, points), likelihood.runner
-    sample = Likelihood.of(sample_set, likelihood.model, memory=layout.allowed, runner=runner)
+    sample_set = thinned(likelihood.calset, max(limits.SAMPLE, layout.points // limits.FARTHEST))
+    sample = Likelihood.of(sample_set, likelihood.model, runner=likelihood.runner)
     sample = sample.with_errors_at(likelihood.errors_at)
     best = find_minimum(sample, first, noise_scale, worth)
-    scale, starts = best.expansion.noise_scale, best.starts
-    stride = strips_of(likelihood) // FIRST_STRIPS if on_pixels else 0
-    passes = [("fit of some image rows", stride, 1.0)] if stride > 1 else []
-    passes.append((f"fit of all {'pixels' if on_pixels else 'points'}", 1, LARGE_TOLERANCE))
-    for label, step, tolerance in passes:
-
-        def of_pixels(values: Vector, scale: float, _: Expansion | None, stride: int = step) -> Expansion:
-            return expand_pixels(likelihood, values, scale, stride)
-
-        how = {"expand": of_pixels if on_pixels else None, "tolerance": tolerance, "damping": 0.0}
-        best = _search(likelihood, label, best.x, scale, **how)
-    return dataclasses.replace(best, starts=starts)
+    scale = best.expansion.noise_scale
+    found = _search(likelihood, "fit of all points", best.x, scale, tolerance=LARGE_TOLERANCE, damping=0.0)
+    return dataclasses.replace(found, starts=best.starts)
 
 
 def _best_gaps(likelihood: Likelihood, best: Found) -> Found:

@@ -1,1 +1,1 @@
-"""χ² of data with its gradient and matrix: fluxes eliminated, priors, tables, frames, threads."""
+"""χ² of data with its gradient and matrix: fluxes eliminated, priors, tables, threads."""

@@ -11,8 +11,7 @@ Three layers, each with its own small Jacobian:
 Flux           of every (exposure, point) is eliminated (`flux.py`). Where an effect of the detectors D acts, the model
                is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
 Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated all that could
-               be kept of a point holds only near one set of values, as F and â depend on them. Whole frames, whose
-               counts are smooth over the field, are summed over cells near one set of values instead (`frames.py`).
+               be kept of a point holds only near one set of values, as F and â depend on them.
 """
 
 from __future__ import annotations
@@ -310,7 +309,7 @@ def _residuals(
 def residuals_and_slopes(
     instrument: Instrument, plan: Plan, data: PointData
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
-    """All residuals and their derivatives with respect to all parameters: for tables, not for whole frames."""
+    """All residuals and their derivatives with respect to all parameters."""
     residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size

@@ -1,8 +1,7 @@
 """Layout of the computation for a set under a model, and its pieces: decided once, before anything is computed.
 
-Measurements come in batches of field points of equal size. A set that fits into half of the memory it may take is
-turned into arrays once. A larger one is read, slab by slab, on every pass: memory is that of a few slabs however many
-points there are.
+Measurements come in batches of field points of equal size, and are turned into arrays once. Threads work on parts of
+some batches each.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from walop_jax.data.merge import without_frames
 from walop_jax.data.records import (
     Block,
     CalibrationSet,
@@ -50,20 +48,14 @@ THINNEST = 1e-3  # deg: shortest side of a rectangle with nodes
 class Layout:
     """The plan of the exposures, and how the field points are cut.
 
-    There are `points` field points, `batch` in a batch (one call of the engine) and `slab` in a slab (read together, by
-    one thread). `kept` says whether their data stay in memory, `memory` how many bytes going through them takes
-    (estimated), of those `allowed`. `interpolated` says whether the optics are to be solved on nodes over `rectangle`
-    (deg) and interpolated, `large` whether a fit should do with as few passes as can be, `mirrored` whether the
-    optics of the opposite points are needed too, for ghosts.
+    There are `points` field points, `batch` in a batch (one call of the engine). `interpolated` says whether the optics
+    are to be solved on nodes over `rectangle` (deg) and interpolated, `large` whether a fit should do with as few
+    passes as can be, `mirrored` whether the optics of the opposite points are needed too, for ghosts.
     """
 
     plan: Plan
     points: int
     batch: int
-    slab: int
-    kept: bool
-    memory: int
-    allowed: float
     interpolated: bool
     large: bool
     mirrored: bool
@@ -77,17 +69,14 @@ class Layout:
         model: Model,
         probes: tuple[Effect, ...] = (),
         *,
-        memory: float | None = None,
-        threads: int = 1,
         batch: int | None = None,
         interpolate: bool | None = None,
         sets: int = 1,
     ) -> Layout:
         """Lay out a set under a model; `probes` are effects beyond the model whose columns will be asked for.
 
-        `memory` (bytes) is what point data may take, None for the usual 2 GB; `threads` is the number of slabs in use
-        at a time. `batch` and `interpolate` are decided by the size of the set where they are None; `sets` is how many
-        such sets come.
+        `batch` and `interpolate` are decided by the size of the set where they are None; `sets` is how many such sets
+        come.
         """
         planned = planned_instrument(calset, model)
         probed = dataclasses.replace(planned, effects=(*planned.effects, *probes))
@@ -100,22 +89,10 @@ class Layout:
         interpolated = points > limits.INTERPOLATE_ABOVE if interpolate is None else interpolate
         usual = limits.LARGE_BATCH if interpolated else limits.BATCH
         batch = min(batch or usual, points)
-        allowed = limits.MEMORY if memory is None else memory
-        fields = len(fields_of_stars(calset.sources))
-        point_bytes = bytes_per_point(exposures, calset.cameras, mirrored=mirrored, fields=fields)
-        in_memory = 2 * point_bytes * points <= allowed
-        # Whole batches; and many of them, as pixels are read in whole rows of the frames.
-        share = int(allowed) // (limits.READING * threads)
-        slab_bytes = min(limits.LARGEST_SLAB, share, point_bytes * points // limits.SLABS)
-        slab = batch * max(1, slab_bytes // (point_bytes * batch))
         return cls(
             plan=plan,
             points=points,
             batch=batch,
-            slab=slab,
-            kept=in_memory,
-            memory=2 * point_bytes * points if in_memory else limits.READING * threads * point_bytes * slab,
-            allowed=allowed,
             interpolated=interpolated,
             large=interpolated and points > limits.LARGE_ABOVE,
             mirrored=mirrored,
@@ -129,9 +106,9 @@ class Layout:
         return -(-self.points // self.batch)
 
     @property
-    def slabs(self) -> int:
-        """Number of slabs."""
-        return -(-self.points // self.slab)
+    def part(self) -> int:
+        """Field points of a part, that is of the batches that one thread works on."""
+        return self.batch * max(1, self.points // (limits.PARTS * self.batch))
 
 
 def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
@@ -149,11 +126,6 @@ def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
     """The curves of the filters in use."""
     names = np.unique(calset.exposures.filter).tolist()
     return [calset.filters[name] for name in names if name in calset.filters]
-
-
-def bytes_per_point(exposures: int, cameras: int = 4, *, mirrored: bool = False, fields: int = 0) -> int:
-    """Bytes of one field point: counts, weights, sky, source, band; the first two again for each field of stars."""
-    return 8 * (2 + exposures * (2 * (1 + fields) * cameras + (4 if mirrored else 2) + 1 + 1))
 
 
 def fields_of_stars(sources: Sources) -> Float[np.ndarray, "f s"]:
@@ -202,22 +174,14 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     """A set of at most `most` of the points: runs of at least `neighbours` spread evenly over all of them.
 
     There are 16 runs or more and 128 at most, so they are shorter or longer than that in a very small or a very large
-    sample. A set that is not larger than that comes back as it is. A table beside whole frames, which may hold all that
-    there is of a kind of exposure, is in it with all of its points, or with half as many as there may be.
+    sample. A set that is not larger than that comes back as it is.
     """
     n = len(calset.points)
     if n <= most:
         return calset
     fewest, largest = limits.RUNS
     length = max(1, min(max(neighbours, most // largest), most // fewest))
-    beside = without_frames(calset)
-    last = 0 if beside is None else len(beside.points)
-    if last <= most // 2:
-        of_table = n - length * np.arange(math.ceil(last / length), 0, -1)
-    else:
-        of_table = n - last + _spread(last, most // 2, length)
-    starts = _spread(n - last, most - length * len(of_table), length)
-    starts = np.append(starts[starts + length <= min(of_table, default=n)], of_table)
+    starts = _spread(n, most, length)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
     runs = RunsOfPoints(calset.intensities, starts, length)
@@ -233,13 +197,13 @@ def _spread(points: int, sample: int, length: int) -> Int[np.ndarray, " s"]:
 def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
     """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
 
-    Of a set with more than `limits.MEDIAN_POINTS` points, slabs spread evenly over it are enough.
+    Of a set with more than `limits.MEDIAN_POINTS` points, runs spread evenly over it are enough.
     """
-    n, slab, limit = len(calset.points), limits.MEDIAN_SLAB, limits.MEDIAN_POINTS
-    starts = range(0, n, slab) if n <= limit else np.linspace(0, n - slab, limit // slab).astype(int)
+    n, run, limit = len(calset.points), limits.MEDIAN_RUN, limits.MEDIAN_POINTS
+    starts = range(0, n, run) if n <= limit else np.linspace(0, n - run, limit // run).astype(int)
     counts = []
     for start in starts:
-        block = calset.intensities.block(int(start), min(int(start) + slab, n))
+        block = calset.intensities.block(int(start), min(int(start) + run, n))
         counts.append(np.where(block.used[:, :, None], block.counts, np.nan))
     return median_over_field(np.concatenate(counts))
 
@@ -288,7 +252,7 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(block.sigma, block.counts, self._floor())
+        sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         if self.noise is not None:
             weight = weight / np.sqrt(variance_ratio(self.noise, self.noise_terms, block.counts, weight))
@@ -311,13 +275,6 @@ class PointReader:
         noise = self.instrument.noise or Noise.of()
         return NoiseTerms.of(noise, self.calset.exposures.kind.tolist(), self.instrument.cameras.names)
 
-    def _floor(self) -> float | Float[np.ndarray, "e 1"]:
-        """`Cameras.floor`, in each exposure: where points stand for pixels, it has counted for each of these."""
-        floor, compression = self.instrument.cameras.floor, self.calset.compression
-        if compression is None or floor == 0.0:
-            return floor
-        return np.where(compression.covers(self.calset.exposures), 0.0, floor)[:, None]
-
     def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
         """`Sharing.stars`: q, u of a star differ from those of its field by the same in all exposures of its point."""
         share = np.asarray(star_responses(self.instrument, self.plan, array(fields), data))
@@ -330,37 +287,31 @@ class PointReader:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredPoints:
-    """The measurements of a set, batch by batch as `layout` cuts it; the last batch is filled up with weight 0.
-
-    They are read once if the layout keeps them in memory, else anew in every pass.
-    """
+    """The measurements of a set, batch by batch as `layout` cuts it; the last batch is filled up with weight 0."""
 
     reader: PointReader
     layout: Layout
 
-    def slab(self, number: int) -> list[PointData]:
-        """The batches of one slab, counted from 0."""
-        if not self.layout.kept:
-            return self._read(number)
-        batches_per_slab = self.layout.slab // self.layout.batch
-        return self._all[number * batches_per_slab : (number + 1) * batches_per_slab]
-
-    def _read(self, number: int) -> list[PointData]:
-        size = self.layout.slab
-        return self.reader.batches(number * size, (number + 1) * size, self.layout.batch)
+    def part(self, number: int) -> list[PointData]:
+        """The batches of one part, counted from 0."""
+        batches_per_part = self.layout.part // self.layout.batch
+        return self._all[number * batches_per_part : (number + 1) * batches_per_part]
 
     @cached_property
     def _all(self) -> list[PointData]:
-        return [batch for number in range(self.layout.slabs) for batch in self._read(number)]
+        points, part = self.layout.points, self.layout.part
+        starts = range(0, points, part)
+        return [
+            batch for start in starts for batch in self.reader.batches(start, start + part, self.layout.batch)
+        ]
 
     def __len__(self) -> int:
         return self.layout.batches
 
     def __iter__(self) -> Iterator[PointData]:
-        for number in range(self.layout.slabs):
-            yield from self.slab(number)
+        return iter(self._all)
 
     def gathered(self, field: str) -> np.ndarray:
-        """A field of the point data of all points in one array, without the padding: for sets that memory can hold."""
+        """A field of the point data of all points in one array, without the padding."""
         arrays = [np.asarray(getattr(batch, field)) for batch in self]
         return np.concatenate(arrays)[: self.layout.points]

@@ -108,7 +108,7 @@ class Expansion:
     census: Census
     dof: int
     optics: OpticsUsed
-    log_variance: float = dataclasses.field(default=0.0, kw_only=True)
+    log_variance: float = 0.0
 
     @property
     def chi2(self) -> float:
@@ -175,10 +175,9 @@ def prior_rows(model: Model) -> PriorRows:
 class Likelihood:
     """The joint likelihood of one calibration set under one model.
 
-    Field points are handled in batches of equal size, so that a set larger than memory goes through the same code
-    (`likelihood/layout.py`), several of them at a time (`likelihood/runner.py`). Where `layout` says so, `expand`
-    and `residuals` solve the optics on Chebyshev nodes only (`likelihood/field_table.py`). Immutable: what a pass
-    finds out beside its sums comes back with them (`Expansion`).
+    Field points are handled in batches of equal size (`likelihood/layout.py`), several of them at a time
+    (`likelihood/runner.py`). Where `layout` says so, `expand` and `residuals` solve the optics on Chebyshev nodes only
+    (`likelihood/field_table.py`). Immutable: what a pass finds out beside its sums comes back with them (`Expansion`).
 
     Errors of the data that have parameters (`model.noise`) are those of the values that a method is given, unless
     `errors_at` says at which values (a full vector) they are held: a fit hands on its likelihood with errors as fitted.
@@ -216,10 +215,10 @@ class Likelihood:
     ) -> Likelihood:
         """Bring a set and a model together; `probes` are effects beyond the model whose columns will be asked for.
 
-        `options` are those of `Layout.of`: memory, batch, interpolate, sets.
+        `options` are those of `Layout.of`: batch, interpolate, sets.
         """
         runner = runner or Runner()
-        layout = Layout.of(calset, model, probes, threads=runner.threads, **options)
+        layout = Layout.of(calset, model, probes, **options)
         reader = PointReader(calset, layout.plan, model.template, layout.mirrored)
         return cls(layout, MeasuredPoints(reader, layout), runner, model)
 
@@ -229,7 +228,7 @@ class Likelihood:
         if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
             return self
         model, layout = dataclasses.replace(self.model, template=instrument), self.layout
-        how = {"memory": layout.allowed, "interpolate": layout.interpolated, "sets": layout.sets}
+        how = {"interpolate": layout.interpolated, "sets": layout.sets}
         return Likelihood.of(self.calset, model, runner=self.runner, **how)
 
     def with_errors_at(self, values: Vector | None) -> Likelihood:
@@ -387,10 +386,10 @@ class Likelihood:
         """Results of a function for each batch of points, joined."""
 
         def work(number: int) -> Joined:
-            return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.slab(number)))
+            return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.part(number)))
 
-        slabs = self.runner.each(label, work, self.layout.points, self.layout.slab)
-        return functools.reduce(lambda a, b: a.joined(b), slabs)
+        parts = self.runner.each(label, work, self.layout.points, self.layout.part)
+        return functools.reduce(lambda a, b: a.joined(b), parts)
 
     def _counted(self, data: engine.PointData) -> Census:
         used = np.asarray(data.weight)[..., 0] > 0
@@ -421,7 +420,6 @@ class Likelihood:
         """Best flux and normalised residuals (data − model)/σ of every (point, exposure); 0 where unused.
 
         The flux is the mean over the arms where each has its own; errors that have parameters are those of `values`.
-        For whole frames take a sample (`layout.thinned`).
         """
         if self.fits_errors:
             return self.with_errors_at(values).residuals(values)
@@ -445,7 +443,7 @@ class Likelihood:
         return log_variance(ratio, light, self.flux_known, shared)
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
-        """Derivatives of the used residuals with respect to the free parameters, dense: for tables, not frames.
+        """Derivatives of the used residuals with respect to the free parameters, dense.
 
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """

@@ -5,7 +5,7 @@ Nothing here changes results, only the pieces of a computation, or how large a p
 
 from __future__ import annotations
 
-# ------------------------------------------------------------------------------------- batches, slabs, memory
+# ------------------------------------------------------------------------------------- batches and parts of a set
 
 BATCH = 16
 """Field points whose optics are solved together, for a set as for nodes: what 144 of them need at a time leaves the
@@ -16,21 +16,13 @@ ACCELERATOR_BATCH = 512
 """The same where thousands of threads have to be kept busy: 40 MB of optics for a gradient."""
 LARGE_BATCH = 1024
 """Field points whose optics are interpolated: each of them costs less, and the engine divides it further."""
-MEMORY = 2e9
-"""Default limit of the point data (bytes): half of them for a set that is kept, all for one read anew."""
-READING = 5
-"""Bytes that reading takes for a moment, times those of the slab: the file, its float64, masks and a copy or two."""
-LARGEST_SLAB = 1 << 26
-"""Bytes of point data that are read together at most: larger slabs are no faster."""
-SLABS = 16
-"""A set is cut into so many slabs at least, if it has as many batches: work for several threads."""
+PARTS = 16
+"""A set is cut into so many parts at least, if it has as many batches: work for several threads."""
 
 # ---------------------------------------------------------------------------------------- within one batch
 
 JACOBIAN_BLOCK = 64
 """Field points whose Jacobians are worked on together: these stay in the processor's cache."""
-COLUMNS = 256
-"""Columns of an image row that are worked on together: the sums of four cameras and 25 exposures take a megabyte."""
 RESPONSES_TOGETHER = 32
 """Field points whose responses are computed together: one program serves sets of any size."""
 RESPONSES_AT_ONCE = 4
@@ -59,18 +51,12 @@ SAMPLE = 16384
 FARTHEST = 32
 """Points of a set for each one of its sample at most: the minima are then some six standard errors apart, and a step
 leaves a thousandth of that."""
-CELLS = 128
-"""Cells of whole frames along the longer side in which pixels are summed: 1.5 MB for each exposure."""
-COMPRESSED_BLOCKS, COMPRESSED_POINTS = 6, 4
-"""Blocks of cells, and points of a block, along a side of frames that are compressed."""
-STRIP_ROWS = 32
-"""Image rows, at least, that are read together."""
 MEDIAN_POINTS = 65536
 """Field points that the median of the counts is taken of: its error is then half a per cent of the scatter."""
-MEDIAN_SLAB = 4096
-"""Field points that are read together for the median: whole rows of a frame."""
+MEDIAN_RUN = 4096
+"""Field points that are looked at together for the median."""
 NEIGHBOURS = 256
-"""Points of a sample that lie side by side: frames are read in rows, and single pixels cost as much as a row."""
+"""Points of a sample that lie side by side: a block of a table costs as much for one of them as for a row."""
 RUNS = (16, 128)
 """Smallest and largest number of runs of neighbours in a sample: spread over the field, yet few to read."""
 

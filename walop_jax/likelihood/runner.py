@@ -1,7 +1,7 @@
-"""Passes over the points of a set: slab by slab, on several threads and devices, with progress.
+"""Passes over the points of a set: part by part, on several threads and devices, with progress.
 
-Slabs are worked on by as many threads as there are processor cores, or by two for each of the other devices of this
-process. Results come in the order of the slabs, so that their sum depends on no timing and not on the number of
+Parts are worked on by as many threads as there are processor cores, or by two for each of the other devices of this
+process. Results come in the order of the parts, so that their sum depends on no timing and not on the number of
 threads. (One array sharded over two CPU devices took 12 µs a point where two threads took 10 and one 15: the engine's
 work on a block is too small to be cut further.)
 """
@@ -43,19 +43,19 @@ class Runner:
         if self.progress is not None:
             self.progress(text)
 
-    def each(self, label: str, work: Callable[[int], T], points: int, slab: int) -> Iterator[T]:
-        """The results of `work` for all slabs of `slab` points, in order; `label` names the pass in progress."""
+    def each(self, label: str, work: Callable[[int], T], points: int, part: int) -> Iterator[T]:
+        """The results of `work` for all parts of `part` points, in order; `label` names the pass in progress."""
         began = last = time.perf_counter()
-        with contextlib.closing(self._each(-(-points // slab), work)) as results:
+        with contextlib.closing(self._each(-(-points // part), work)) as results:
             for count, result in enumerate(results, start=1):
                 time_now = time.perf_counter()
                 if time_now - last > TOLD_EVERY:
-                    last, ready, rate = time_now, min(count * slab, points), count * slab / (time_now - began)
+                    last, ready, rate = time_now, min(count * part, points), count * part / (time_now - began)
                     seconds = f"{(points - ready) / rate:.0f} s left of this pass"
                     self.tell(f"{label}: {ready:,} of {points:,} points, {rate:,.0f} points/s, {seconds}")
                 yield result
 
-    def _each(self, slabs: int, work: Callable[[int], T]) -> Generator[T, None, None]:
+    def _each(self, parts: int, work: Callable[[int], T]) -> Generator[T, None, None]:
         devices = jax.local_devices()
 
         def on_device(number: int) -> T:
@@ -67,11 +67,11 @@ class Runner:
 
         # The first one alone: it compiles.
         yield on_device(0)
-        if slabs == 1 or self.threads == 1:
-            yield from map(on_device, range(1, slabs))
+        if parts == 1 or self.threads == 1:
+            yield from map(on_device, range(1, parts))
             return
         pool = ThreadPoolExecutor(self.threads)
         try:
-            yield from pool.map(on_device, range(1, slabs))
+            yield from pool.map(on_device, range(1, parts))
         finally:
             pool.shutdown(wait=True, cancel_futures=True)

@@ -66,12 +66,14 @@ def check_clock(exposures: Exposures, site: Site) -> None:
 
 
 def of_exposures(calset: CalibrationSet, keep: Bool[np.ndarray, " e"]) -> CalibrationSet:
-    """The set with some of its exposures. Raises `DataError` for frames, and for a set that stands for frames."""
+    """The set with some of its exposures. Raises `DataError` for intensities that are no table."""
     if keep.all():
         return calset
     intensities = calset.intensities
-    if not isinstance(intensities, TableIntensities) or calset.compression is not None:
-        raise DataError("frames of several nights are in one set; give each night as a file of its own")
+    if not isinstance(intensities, TableIntensities):
+        raise DataError(
+            "several nights are in one set that is no table; give each night as a file of its own"
+        )
     rows, place = keep[intensities.exposure], np.cumsum(keep) - 1
     names = ("point", "source", "counts", "sigma", "flag", "used", *["sky"] * (intensities.sky is not None))
     columns = {name: getattr(intensities, name)[rows] for name in names}

@@ -141,9 +141,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
         likelihood = Likelihood.of(calset, model)
         if likelihood.layout.large:
             what = "the posterior of so many is as good as normal, and calibration.fits holds its covariance"
-            advice = (
-                f"sample a set of up to {limits.LARGE_ABOVE} points; walop-jax refit --compress makes one"
-            )
+            advice = f"sample a set of up to {limits.LARGE_ABOVE} points"
             many = f"has {len(calset.points)} field points"
             raise fail(f"{many}: {what}", file=calibration.inputs[0].path, advice=advice)
         values = calibration.values[fitted]

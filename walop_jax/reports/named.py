@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.calibration.residual_map import POINTS_PER_CELL
 from walop_jax.data.kinds import CALIBRATION_PLATE
 from walop_jax.io.errors import fail, nearest
 from walop_jax.io.names import FIGURE_DATA, LIMITS, POSTERIOR, PRODUCT
+from walop_jax.likelihood import limits
 from walop_jax.model.cameras import Cameras
 from walop_jax.paper.polynomial import TERMS
 from walop_jax.paper.wavelength import plate_names
@@ -33,7 +35,9 @@ def _accuracy(source: FigureSource) -> AnyFigure:
 def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
     c = source.required_calibration
     if source.likelihood.layout.large:
-        raise fail("was fitted to whole frames", file=source.folder, advice="plot residual-map")
+        raise fail(
+            "has too many field points to be drawn one by one", file=source.folder, advice="plot residual-map"
+        )
     shown = source.likelihood, c.values, c.model.start, source.canvas
     return figures.calibration_figure(source.maps, *shown) if whole else figures.residuals_figure(*shown)
 
@@ -41,7 +45,7 @@ def _residuals(source: FigureSource, whole: bool = False) -> AnyFigure:
 def _residual_map(source: FigureSource) -> AnyFigure:
     calibration = source.required_calibration
     if calibration.residuals is None:
-        advice = "it comes with sets of whole frames"
+        advice = "it comes with whole frames, and with sets of many field points"
         raise fail("holds no map of residuals", file=source.folder, advice=advice)
     return figures.residual_map_figure(calibration.residuals, calibration.design.cameras, source.canvas)
 
@@ -118,8 +122,10 @@ class NamedFigure(NamedTuple):
 
 
 def _small(source: FigureSource) -> bool:
-    """True where there are the data of the fit, a set of points; those of whole frames have a map of residuals."""
-    return DATA in source and (source.calibration is None or source.calibration.residuals is None)
+    """True where there are the data of the fit, of so few field points that each of them can be drawn."""
+    residuals = None if source.calibration is None else source.calibration.residuals
+    few = residuals is None or residuals.grid.pixels * POINTS_PER_CELL < limits.LARGE_ABOVE
+    return DATA in source and few
 
 
 def _plates(source: FigureSource) -> list[str]:

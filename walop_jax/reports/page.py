@@ -289,7 +289,7 @@ def _residual_pictures(run: RunContents) -> list[Picture]:
 
 
 def _matrix_pictures(run: RunContents) -> list[Picture]:
-    """Maps of the instrument matrix, of its errors, and of the residuals of whole frames."""
+    """Maps of the instrument matrix, of its errors, and of the residuals, where there is one."""
     if run.calibration is None:
         return []
     maps, residuals = run.calibration.maps, run.calibration.residuals

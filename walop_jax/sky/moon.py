@@ -86,8 +86,7 @@ def moon_sky(
     """Return q and u of the moonlit sky for δ = 1, in the instrument frame.
 
     `mjd` UTC days at mid-exposure; `ra`, `dec` the field centre and `rotator` the position angle of +X,
-    degrees; `x`, `y` degrees in the instrument frame. Memory is about ten arrays of points × exposures:
-    for whole frames call it with a slab of the points at a time, after `body_direction`.
+    degrees; `x`, `y` degrees in the instrument frame. Memory is about ten arrays of points × exposures.
 
     Raises `DataError` if an input is not finite or the site or time is unusable.
     """
