@@ -52,7 +52,7 @@ def test_the_calls_of_the_script_are_there(script: Any, tmp_path: Path):
     assert list(times) == [
         "fit of a table", "residuals", "posterior density", "its gradient", "Jacobian of the residuals",
         "gradient, 34 points", "density of 2 instruments", "Mueller matrices of 2 instruments",
-        "chi2, gradient, matrix of 8 x 8 pixels",
+        "chi2, gradient, matrix of cells of 8 x 8 pixels",
     ]  # fmt: skip
     assert held["Mueller matrices of 2 instruments"].shape == (2, 4, 4, 4)
 

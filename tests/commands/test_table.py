@@ -59,7 +59,7 @@ def test_defaults_are_those_of_what_is_called():
     assert default("diagnose", "minutes") is None
     assert default("compare", "filter") == default("trace", "filter") == DEFAULT_FILTER
     assert default("apply", "debias") == ESTIMATORS[0]
-    for key in ("sampler", "walkers", "interval", "maximum_steps", "moves", "inflate"):
+    for key in ("sampler", "walkers", "interval", "maximum_steps", "moves"):
         assert default("sample", key) == getattr(Options(), key)
 
 

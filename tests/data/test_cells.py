@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -279,3 +280,20 @@ def test_a_fit_of_the_cells_is_that_of_all_pixels(tmp_path):
     assert np.abs(moved).max() < 0.3
     np.testing.assert_allclose(ours.sigma[free] / pixels.sigma[free], 1.0, atol=0.03)
     assert abs(ours.chi2 - ours.dof) < 5 * np.sqrt(2 * ours.dof)
+
+
+def test_pixels_are_read_piece_by_piece(tmp_path):
+    """Frames of 640 x 480 pixels in float64, 200 MB of them: less than a quarter is in memory at any time."""
+    grid = Grid(640, 480, (320.5, 240.5), (0.0, 0.0), ((0.0008, 0.0), (0.0, 0.0008)))
+    x, y = grid.xy(0, grid.pixels)
+    counts = 1e4 * shares(x, y) * (1.0 + x[:, None, None])
+    calset = walop.from_arrays(counts, np.sqrt(counts), x, y, ANGLES)
+    write_frames(tmp_path / "frames.fits", calset, grid, dtype="f8")
+    of_images = 2 * counts.nbytes
+    del counts, calset
+    tracemalloc.start()
+    cells = read_calibration_set(tmp_path / "frames.fits")
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(cells.points) > 4000
+    assert most < 0.25 * of_images
