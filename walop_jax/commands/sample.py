@@ -33,7 +33,7 @@ OPTIONS = {
     "data": Option(
         "Calibration set of the fit, if it has moved; again for each.", metavar="CALSET", kind=list[Path]
     ),
-    "sampler": Option("emcee, nuts, or your own as FILE.py:CLASS.", metavar="NAME", kind=str),
+    "sampler": Option("emcee, nuts, bootstrap, or your own as FILE.py:CLASS.", metavar="NAME", kind=str),
     "maximum_steps": Option("Stop there at the latest, converged or not; a multiple of --interval.", least=1),
     "walkers": Option("Walkers of an emcee ensemble; 0: at least 64.", least=0),
     "interval": Option("Steps after which convergence is judged and the chain kept.", least=1),
@@ -63,6 +63,9 @@ def sample(
     The chain of emcee is kept in RUN/sampling: an interrupted run goes on with --resume, and refuses if data, model,
     priors, sampler, settings or versions have changed. Other samplers start anew. A chain that has not converged is
     written and marked so, with exit code 1; the covariance of the fit then stays in calibration.fits.
+
+    The sampler bootstrap has no chain: it repeats the fit on 1000 sets that are simulated from it, on fewer with
+    --maximum-steps.
 
     In Python: a `PosteriorSample`, of a fit in memory or of a run, which is then written. `parameters` names the
     sampled ones (None: the physics coefficients); `options` (`walop.Options`) are all settings at once, with those that

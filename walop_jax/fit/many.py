@@ -143,21 +143,21 @@ class ManyFits(Displayed):
 
 def refit_many(
     calsets: Sequence[CalibrationSet],
-    model: Model | None = None,
+    model: Model | Sequence[Model] | None = None,
     *,
     progress: Callable[[str], None] | None = None,
 ) -> ManyFits:
     """The joint fit of each of many sets of one layout, in seconds for hundreds of them.
 
-    `model` serves all sets, which must have the SOURCES of the first one then; None: each set has its
-    `walop.base_model`, with the catalogue values of its own standards as priors. Each fit equals `walop.refit` of its
-    own set, but its residuals are not examined. Example: of noise realisations of one run, `to_table` has the scatter
-    of every parameter beside its stated error,
+    `model` serves all sets, which must have the SOURCES of the first one then. Of a sequence of models each set has its
+    own, with the same parameters but other priors. None: each set has its `walop.base_model`, with the catalogue values
+    of its own standards as priors. Each fit equals `walop.refit` of its own set, but its residuals are not examined.
+    Example: of noise realisations of one run, `to_table` has the scatter of every parameter beside its stated error,
 
     >>> walop.refit_many(realisations).to_table()["NAME", "SCATTER", "ERROR"]  # doctest: +SKIP
 
-    Raises `DataError` for no sets, for a set of another layout than the first one (with its position), and for sets
-    whose optics are interpolated; ValueError where exposures cannot determine the instrument.
+    Raises `DataError` for no sets, for a set of another layout than the first one (with its position), for another
+    number of models than of sets, and for whole frames; ValueError where exposures cannot determine the instrument.
     """
     began = time.perf_counter()
     if not calsets:
@@ -312,9 +312,15 @@ def _inputs(likelihood: Likelihood) -> tuple[Instrument, Plan, PointData]:
     return likelihood.model.template, layout.plan, data
 
 
-def _likelihoods(calsets: Sequence[CalibrationSet], given: Model | None) -> list[Likelihood]:
+def _likelihoods(
+    calsets: Sequence[CalibrationSet], given: Model | Sequence[Model] | None
+) -> list[Likelihood]:
     """The likelihood of each set; a set with the exposures and sources of the first one shares its layout."""
-    model = given or base_model(calsets[0])
+    models = [given] * len(calsets) if isinstance(given, Model) else given
+    if models is not None and len(models) != len(calsets):
+        what = f"there are {len(models)} models for {len(calsets)} sets"
+        raise fail(what, advice="give one model for all sets, or one for each")
+    model = models[0] if models else base_model(calsets[0])
     first = Likelihood.of(calsets[0], model)
     if first.layout.interpolated:
         what = f"set 0 has {first.layout.points} field points"
@@ -329,14 +335,21 @@ def _likelihoods(calsets: Sequence[CalibrationSet], given: Model | None) -> list
         if needs_no_counts and not differ:
             reader = PointReader(calset, first.plan, model.template, first.layout.mirrored)
             points = MeasuredPoints(reader, first.layout)
-            likelihoods.append(Likelihood(first.layout, points, first.runner, model))
+            own = model if models is None else models[n]
+            _check_parameters(own, model, n)
+            likelihoods.append(Likelihood(first.layout, points, first.runner, own))
         else:
-            own = model if given is not None else base_model(calset)
-            if (own.names, own.free.tolist()) != (model.names, model.free.tolist()):
-                advice = "sets that are fitted together need the same parameters: fit it by itself with walop.refit"
-                raise fail(f"set {n} has another model than set 0", advice=advice)
+            own = models[n] if models is not None else base_model(calset)
+            _check_parameters(own, model, n)
             likelihoods.append(Likelihood.of(calset, own))
     return likelihoods
+
+
+def _check_parameters(own: Model, first: Model, number: int) -> None:
+    """Raise `DataError` for the model of a set whose parameters are not those of the first one."""
+    if (own.names, own.free.tolist()) != (first.names, first.free.tolist()):
+        advice = "sets that are fitted together need the same parameters: fit it by itself with walop.refit"
+        raise fail(f"set {number} has another model than set 0", advice=advice)
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -429,13 +429,17 @@ class Likelihood:
         flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
+    @property
+    def points_as_stated(self) -> MeasuredPoints:
+        """The points with the errors that the set states, whatever was fitted of them."""
+        return self.with_errors_at(None).points
+
     def log_variance(self, values: Vector) -> Float[np.ndarray, "p e"]:
         """What −2 ln L has beside χ² at a full vector of values, of every (point, exposure); 0 without noise terms."""
         noise = self.model.instrument(values).noise
         if noise is None:
             return np.zeros((self.layout.points, len(self.calset.exposures)))
-        stated = dataclasses.replace(self.points, reader=dataclasses.replace(self.points.reader, noise=None))
-        counts, weight = map(stated.gathered, ("counts", "weight"))
+        counts, weight = map(self.points_as_stated.gathered, ("counts", "weight"))
         ratio = variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
         residual = self.with_errors_at(values).residuals(values)[1]
         light = np.where(weight > 0, counts * weight / np.sqrt(ratio) - residual, 0.0)

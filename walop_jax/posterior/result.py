@@ -123,7 +123,7 @@ def _of_rows(likelihood: Likelihood) -> dict[str, Dataset]:
     """ArviZ's groups of the data: the used rows (point, exposure), with the ids of both as coordinates."""
     from xarray import Dataset
 
-    calset, gathered = likelihood.calset, likelihood.points.gathered
+    calset, gathered = likelihood.calset, likelihood.points_as_stated.gathered
     used = likelihood.used
     point, exposure = np.nonzero(used)
     names = list(likelihood.model.template.cameras.names)
@@ -227,7 +227,7 @@ class Options:
             raise ValueError("at least two independent ensembles are needed to judge convergence")
         if min(self.interval, self.draws, self.checks, self.maximum_steps) < 1 or self.thin < 0:
             raise ValueError("interval, draws, checks and maximum_steps must be 1 or more, thin not negative")
-        if self.maximum_steps < self.interval:
+        if self.maximum_steps < self.interval and not sampler.repeats_the_fit:
             what = f"maximum_steps {self.maximum_steps} is less than one block"
             raise ValueError(f"{what}: lower interval ({self.interval}) as well")
         thin = self.thin or sampler.thin

@@ -23,7 +23,11 @@ from walop_jax.io.code import classes_of
 from walop_jax.io.errors import fail, nearest
 from walop_jax.model.compiled import compiled
 
-SAMPLERS = {"emcee": "walop_jax.posterior.emcee:Emcee", "nuts": "walop_jax.posterior.nuts:Nuts"}
+SAMPLERS = {
+    "emcee": "walop_jax.posterior.emcee:Emcee",
+    "nuts": "walop_jax.posterior.nuts:Nuts",
+    "bootstrap": "walop_jax.posterior.bootstrap:Bootstrap",
+}
 """One line for each sampler: its name, and module and class."""
 
 Positions = Float[np.ndarray, "n k"]
@@ -84,7 +88,8 @@ class Sampler(abc.ABC):
     Without `exact` it is given the surrogate, in which throughput coefficients and catalogue values are marginalised;
     with it the exact posterior of all free parameters. `software` are the packages whose versions its draws depend on;
     of its steps every `thin`-th is stored, unless something else is asked for. The chains of emcee are kept, so that an
-    interrupted run `resumes`; those of others start anew.
+    interrupted run `resumes`; those of others start anew. One that `repeats_the_fit` on simulated sets has no density
+    and no chains (`posterior.bootstrap`).
 
     The same state and number of steps must always give the same stretch, whatever has been computed before: random
     numbers come from the state.
@@ -95,6 +100,7 @@ class Sampler(abc.ABC):
     software: ClassVar[tuple[str, ...]] = ()
     thin: ClassVar[int] = 1
     resumes: ClassVar[bool] = False
+    repeats_the_fit: ClassVar[bool] = False
 
     @abc.abstractmethod
     def start(self, density: Density, seed: Sequence[int]) -> State:

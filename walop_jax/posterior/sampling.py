@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -198,6 +199,8 @@ def sample(
         as_stated = sample(stated, options, folder=folder, resume=resume, report=report)
         return sandwich_adjusted(as_stated, result.model, inverse, result.covariance, result.errors_from)
     sampler = options.make_sampler()
+    if sampler.repeats_the_fit:
+        return _by_refits(result, options, sampler, report)
     scale = None if sampler.exact else _common_scale(result)
     target = Target(result if scale is None else _with_scale_held(result))
     marks = {} if folder is None else fingerprint(target, options)
@@ -226,6 +229,19 @@ def sample(
     finished = _finish(target, posterior, ensembles, verdict, seconds)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
     return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
+
+
+def _by_refits(result: FitResult, options: Options, sampler: Any, report: Report) -> PosteriorSample:
+    """The posterior by fits to simulated sets (`posterior.bootstrap`)."""
+    from walop_jax.posterior.bootstrap import bootstrapped
+
+    def tell(share: float) -> None:
+        if report is not None:
+            report(Progress("fitting simulated sets", share))
+
+    found = bootstrapped(result, options, sampler, tell)
+    fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
+    return dataclasses.replace(found, of_trusted_fit=result.trusted, fit=fit)
 
 
 def _common_scale(result: FitResult) -> float | None:
