@@ -52,13 +52,13 @@ def test_means_of_priors_are_drawn_about_the_fit(scene: Scene) -> None:
 
 
 def test_its_spread_is_the_covariance_of_the_fit(scene: Scene) -> None:
-    """Where the model is linear within its errors; of 200 draws a standard deviation is known to 5 %."""
+    """Where the model is linear within its errors; of 220 draws a standard deviation is known to 5 %."""
     result = dataclasses.replace(
         scene.result, likelihood=Likelihood.of(scene.result.calset, scene.result.model)
     )
-    found = sample(result, Options(sampler=Bootstrap(refits=200), seed=5))
+    found = sample(result, Options(sampler=Bootstrap(refits=220), seed=5))
     assert found.trusted, found.warnings
-    assert found.counts == {"refits": 200, "converged": 200, "fitted alone": 0}
+    assert found.counts == {"refits": 220, "converged": 220, "fitted alone": 0}
     free = result.model.free
     covariance = result.covariance[np.ix_(free, free)]
     root = np.linalg.cholesky(covariance / np.outer(*2 * (result.sigma[free],)))
@@ -73,6 +73,9 @@ def test_its_spread_is_the_covariance_of_the_fit(scene: Scene) -> None:
 def test_what_it_cannot_do_is_said(scene: Scene) -> None:
     with pytest.raises(DataError, match="2 refits are too few"):
         sample(scene.result, Options(sampler=Bootstrap(refits=2)))
+    few = sample(scene.result, Options(sampler=Bootstrap(refits=40)))
+    assert not few.trusted
+    assert "40 independent draws; the covariance of 43 parameters needs 215" in few.convergence.message()
     with pytest.raises(TypeError, match="no chains"):
         Bootstrap().start(scene.surrogate.density(), [0])
     assert isinstance(walop.Options(sampler="bootstrap", maximum_steps=10).make_sampler(), Bootstrap)

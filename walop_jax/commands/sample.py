@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from walop_jax.posterior.result import PosteriorSample, Progress
 
 CHAINS = "sampling"  # folder, in that of the run, of the chain that is kept
-NOT_CONVERGED = "the posterior has not converged; calibration.fits keeps its covariance"
+NOT_CONVERGED = "the posterior has not converged, or has too few draws; calibration.fits keeps its covariance"
 OUTPUTS = (
     "posterior.nc", "posterior.fits", "posterior.ecsv", "posterior_corner.png", "posterior_trace.png", "sample.json",
 )  # fmt: skip

@@ -31,6 +31,9 @@ from walop_jax.posterior.target import Target, choose_sampled
 ENSEMBLES = 2  # the draws are shared out between, since files have chains
 FEWEST = 0.99
 """Fraction of the fits that have to converge."""
+DRAWS_PER_PARAMETER = 5
+"""Draws for each free parameter from which on their covariance takes the place of that of the fit; of fewer than one
+it would be singular."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,8 +111,9 @@ def bootstrapped(
     shown = target.free[choose_sampled(target, options.parameters)]
     names = tuple(result.model.names[i] for i in shown)
     unity, off = np.ones(len(names)), 1.0 - len(values) / count
-    reasons = (f"{100 * off:.1f} % of the fits did not converge",) if off > 1.0 - FEWEST else ()
-    steps = kept.shape[1]
+    reasons = [f"{100 * off:.1f} % of the fits did not converge"] if off > 1.0 - FEWEST else []
+    if len(values) < (enough := DRAWS_PER_PARAMETER * len(target.free)):
+        reasons.append(f"the covariance of {len(target.free)} parameters needs {enough} or more")
     return PosteriorSample(
         sampler=sampler.name,
         names=result.model.names,
@@ -121,7 +125,17 @@ def bootstrapped(
         chains=kept[:, :, None][..., shown],
         sampled=names,
         thin=1,
-        convergence=Convergence(names, steps, unity, (1.0, 1.0, 1.0), len(values) * unity, unity, 0, reasons),
+        convergence=Convergence(
+            names=names,
+            steps=kept.shape[1],
+            tau=unity,
+            history=(1.0, 1.0, 1.0),
+            ess=len(values) * unity,
+            rhat=unity,
+            needed=0,
+            reasons=tuple(reasons),
+            independent=True,
+        ),
         accuracy=None,
         acceptance=1.0,
         counts={"refits": count, "converged": len(values), "fitted alone": len(fits.alone)},

@@ -51,7 +51,8 @@ RANKED = 100_000  # positions per quantity that R-hat looks at: sorting more tak
 class Convergence:
     """The evidence. `tau` is in steps, per quantity; `history` holds the worst τ after N/4, N/2 and N steps.
 
-    `steps` are those kept after burn-in, `needed` how many more the rules ask for (0 when converged).
+    `steps` are those kept after burn-in, `needed` how many more the rules ask for (0 when converged). Draws that are
+    `independent` by their making have no chain that the rules could judge.
     """
 
     names: tuple[str, ...]
@@ -62,6 +63,7 @@ class Convergence:
     rhat: Float[np.ndarray, " k"]
     needed: int
     reasons: tuple[str, ...]
+    independent: bool = False
 
     @property
     def converged(self) -> bool:
@@ -75,6 +77,9 @@ class Convergence:
 
     def message(self, seconds_per_step: float = math.nan) -> str:
         """One sentence for people."""
+        if self.independent:
+            drawn = f"{self.ess.min():.0f} independent draws"
+            return drawn if self.converged else f"NOT sufficient: {drawn}; {'; '.join(self.reasons)}"
         if self.converged:
             tau = self.tau.max()
             length = f"{self.steps} steps, {self.steps / tau:.0f} τ, τ = {tau:.1f}"
