@@ -40,7 +40,14 @@ from walop_jax.io.plain_tables import astropy_table
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.engine import Normal, PointData
 from walop_jax.likelihood.layout import PointReader
-from walop_jax.likelihood.likelihood import DataTerms, Expansion, Likelihood, MeasuredPoints, OpticsUsed
+from walop_jax.likelihood.likelihood import (
+    Census,
+    DataTerms,
+    Expansion,
+    Likelihood,
+    MeasuredPoints,
+    OpticsUsed,
+)
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
@@ -163,14 +170,17 @@ def refit_many(
     if not calsets:
         raise fail("there are no sets to fit", advice="give at least one calibration set")
     likelihoods = _likelihoods(calsets, model)
-    for one in likelihoods:
-        check_identifiable(one)
+    inputs = [_inputs(one) for one in likelihoods]
+    # The points have been read: they are not read a second time for their numbers.
+    censuses = [one.counted(data) for one, (_, _, data) in zip(likelihoods, inputs, strict=True)]
+    for one, census in zip(likelihoods, censuses, strict=True):
+        check_identifiable(one, census)
     first = fit(likelihoods[0])
     if first.model.template.noise is not None:
         others = tuple(fit(one) for one in likelihoods[1:])
         alone = tuple(range(1, len(likelihoods)))
         return ManyFits((first, *others), alone, time.perf_counter() - began)
-    stack = Stack.of([_inputs(one) for one in likelihoods])
+    stack = Stack.of(inputs)
     searches = {
         n: search_of(
             _nearby(first, one.model)[one.model.free],
@@ -182,7 +192,7 @@ def refit_many(
         if n > 0
     }
     results, alone = [first], []
-    for n, minimum in sorted(_driven(searches, stack, likelihoods, progress).items()):
+    for n, minimum in sorted(_driven(searches, stack, likelihoods, censuses, progress).items()):
         if _is_of_a_single_fit(likelihoods[n], minimum):
             results.append(fit_at(likelihoods[n], minimum, 0.0))
         else:
@@ -212,6 +222,7 @@ def _driven(
     searches: dict[int, Any],
     stack: Stack,
     likelihoods: Sequence[Likelihood],
+    censuses: Sequence[Census],
     progress: Callable[[str], None] | None,
 ) -> dict[int, Minimum[Expansion]]:
     """The minima of searches by their position."""
@@ -222,7 +233,7 @@ def _driven(
             progress(f"{len(found)} of {len(searches)} fits have ended")
         numbers = list(places)
         values = np.stack([likelihoods[n].model.full(places[n]) for n in numbers])
-        expansions = _expansions(stack, likelihoods, numbers, values)
+        expansions = _expansions(stack, likelihoods, censuses, numbers, values)
         places = {}
         for n, expansion in zip(numbers, expansions, strict=True):
             try:
@@ -233,7 +244,11 @@ def _driven(
 
 
 def _expansions(
-    stack: Stack, likelihoods: Sequence[Likelihood], numbers: Sequence[int], values: Float[np.ndarray, "s n"]
+    stack: Stack,
+    likelihoods: Sequence[Likelihood],
+    censuses: Sequence[Census],
+    numbers: Sequence[int],
+    values: Float[np.ndarray, "s n"],
 ) -> Iterator[Expansion]:
     """The expansion of each of some fits at its own values."""
     for begin in range(0, len(numbers), TOGETHER):
@@ -243,9 +258,7 @@ def _expansions(
         normal = Normal(*map(np.asarray, equations_of_many(stack.taken(filled), array(values[rows]))))
         for k, n in enumerate(some):
             likelihood = likelihoods[n]
-            terms = DataTerms(
-                float(normal.chi2[k]), normal.gradient[k].copy(), normal.matrix[k], likelihood.census
-            )
+            terms = DataTerms(float(normal.chi2[k]), normal.gradient[k].copy(), normal.matrix[k], censuses[n])
             yield likelihood.expanded(values[begin + k], terms, 1.0, OpticsUsed(None))
 
 

@@ -17,7 +17,7 @@ from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Expansion, Likelihood
+from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
 from walop_jax.model import materials
 from walop_jax.model.noise import NOISE
 from walop_jax.model.specification import Model, Vector
@@ -218,11 +218,15 @@ def _far_off(likelihood: Likelihood, best: Found) -> Found:
     return dataclasses.replace(best, starts=starts)
 
 
-def check_identifiable(likelihood: Likelihood) -> None:
-    """Raise `DataError` when the exposures cannot determine an instrument at all."""
+def check_identifiable(likelihood: Likelihood, census: Census | None = None) -> None:
+    """Raise `DataError` when the exposures cannot determine an instrument at all.
+
+    `census` is that of its points, where it is at hand: else they are counted.
+    """
+    rows = (likelihood.census if census is None else census).rows
     e, inputs = likelihood.calset.exposures, ", ".join(str(entry.path) for entry in likelihood.calset.inputs)
     polariser = likelihood.model.template.polariser is not None
-    through = (e.clp_in | (not polariser)) & (likelihood.census.rows > 0)
+    through = (e.clp_in | (not polariser)) & (rows > 0)
     angles = np.unique(np.round(np.mod(e.clp_angle[through & e.clp_in], 180.0), 3))
     turning = [e.position(prefix).angle for prefix in likelihood.plan.moving]
     states = np.stack([np.zeros(len(e)), *turning], axis=1)[through]

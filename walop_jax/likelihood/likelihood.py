@@ -328,7 +328,7 @@ class Likelihood:
             if self.fits_errors:
                 return self._terms_with_errors(instrument, data, nodes)
             chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
-            return DataTerms(float(chi2), gradient, matrix, self._counted(data))
+            return DataTerms(float(chi2), gradient, matrix, self.counted(data))
 
         return self._joined("χ², gradient and matrix", of_batch), optics
 
@@ -350,7 +350,7 @@ class Likelihood:
         at, gradient, matrix = self.model.positions(NOISE), np.array(gradient), np.array(matrix)
         gradient[at] += of_errors.gradient
         matrix[np.ix_(at, at)] += of_errors.matrix
-        return DataTerms(float(chi2), gradient, matrix, self._counted(data), of_errors.value)
+        return DataTerms(float(chi2), gradient, matrix, self.counted(data), of_errors.value)
 
     def expanded(self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed) -> Expansion:
         """The expansion from the terms of the data."""
@@ -391,7 +391,8 @@ class Likelihood:
         parts = self.runner.each(label, work, self.layout.points, self.layout.part)
         return functools.reduce(lambda a, b: a.joined(b), parts)
 
-    def _counted(self, data: engine.PointData) -> Census:
+    def counted(self, data: engine.PointData) -> Census:
+        """The census of some points."""
         used = np.asarray(data.weight)[..., 0] > 0
         x, y = (np.asarray(at)[used.any(axis=1)] for at in (data.x, data.y))
         low, high = np.inf, -np.inf
@@ -401,7 +402,7 @@ class Likelihood:
     @cached_property
     def census(self) -> Census:
         """Census of the used rows of the set, by a separate pass; an expansion brings its own census with it."""
-        return self._joined("counting", self._counted)
+        return self._joined("counting", self.counted)
 
     @property
     def independent(self) -> int:
