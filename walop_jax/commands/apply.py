@@ -22,7 +22,7 @@ from walop_jax.commands.command import (
     typed,
 )
 from walop_jax.commands.gather import gather
-from walop_jax.commands.products import Effects, Posterior, Product, calibration_of, catalogue_of
+from walop_jax.commands.products import CalibrationLike, Effects, Posterior, calibration_of, catalogue_of
 from walop_jax.commands.tables import table_of, table_outcome
 from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming
@@ -70,7 +70,7 @@ OPTIONS = {
 @command(stages=("reading", "tabulating", "writing"), writes=(), options=OPTIONS)
 def apply(
     job: Job,
-    calibration: Product,
+    calibration: CalibrationLike,
     catalogue: Any,
     *,
     output: PathLike | None = None,

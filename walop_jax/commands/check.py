@@ -24,7 +24,14 @@ from walop_jax.commands.command import (
     typed,
 )
 from walop_jax.commands.inputs import goal_of, set_of
-from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import (
+    CalibrationLike,
+    Effects,
+    calibration_of,
+    catalogue_of,
+    fit_of,
+    folder_of,
+)
 from walop_jax.io.errors import DataError, errors_naming
 from walop_jax.io.folder import check_apart, output_folder
 from walop_jax.io.names import (
@@ -98,9 +105,9 @@ class Asked:
 )
 def check(
     job: Job,
-    run: Product,
+    run: CalibrationLike,
     *inputs: Any,
-    against: Product | None = None,
+    against: CalibrationLike | None = None,
     append: PathLike | None = None,
     output: PathLike | None = None,
     goal: float | None = None,
@@ -276,7 +283,7 @@ def _subject(run: Any, known: Inputs, against: Any) -> str:
 # ------------------------------------------------------------------------------------------------- is it good?
 
 
-def _commissioned(job: Job, run: Product, effects: Effects, goal: float | None) -> Asked:
+def _commissioned(job: Job, run: CalibrationLike, effects: Effects, goal: float | None) -> Asked:
     """A calibration by itself: its files, physics, accuracy, and what could hide."""
     from walop_jax import Calibration, FitResult, Run
     from walop_jax.calibration.accuracy import GOAL

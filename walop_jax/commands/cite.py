@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from walop_jax.commands.command import Job, Option, Outcome, command
-from walop_jax.commands.products import Effects, Product, calibration_of
+from walop_jax.commands.products import CalibrationLike, Effects, calibration_of
 from walop_jax.io.names import POSTERIOR
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ OPTIONS = {
 
 @command(options=OPTIONS)
 def cite(
-    job: Job, run: Product | None = None, *, bibtex: bool = False, effects: Effects = None
+    job: Job, run: CalibrationLike | None = None, *, bibtex: bool = False, effects: Effects = None
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included.
 

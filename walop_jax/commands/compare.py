@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from walop_jax.commands import products
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, figure_file, typed
 from walop_jax.commands.inputs import ModelLike, Sets, set_and_model, set_of
-from walop_jax.commands.products import Effects, InstrumentLike, Product
+from walop_jax.commands.products import CalibrationLike, Effects, InstrumentLike
 from walop_jax.io.errors import fail
 from walop_jax.io.names import COMPARISON
 
@@ -35,7 +35,7 @@ OPTIONS = {
 def compare(
     job: Job,
     data: Sets,
-    calibration: Product | None = None,
+    calibration: CalibrationLike | None = None,
     *,
     output: PathLike | None = None,
     truth: tuple[Any, Any, Any] | PathLike | None = None,

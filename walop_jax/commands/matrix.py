@@ -29,7 +29,7 @@ OPTIONS = {
 @command(writes="table", options=OPTIONS)
 def matrix(
     job: Job,
-    calibration: products.Product,
+    calibration: products.CalibrationLike,
     x: Any = None,
     y: Any = None,
     *,

@@ -20,7 +20,7 @@ from walop_jax.commands.command import (
     typed,
     write_text,
 )
-from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, is_product
+from walop_jax.commands.products import CalibrationLike, Effects, calibration_of, catalogue_of, is_product
 from walop_jax.io.atomic import check_output
 from walop_jax.io.names import PLANNED
 from walop_jax.io.progress import repeated
@@ -98,7 +98,7 @@ OPTIONS = {
 )
 def plan(
     job: Job,
-    available: ObservingPlan | Product | None = None,
+    available: ObservingPlan | CalibrationLike | None = None,
     *,
     minutes: float = 30.0,
     candidates: Any = None,

@@ -30,7 +30,7 @@ NOT_CARRIED_OVER = "not_carried_over"
 
 Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
 Fit: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
-Product: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
+CalibrationLike: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
 Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
 InstrumentLike: TypeAlias = "Instrument | PathLike | None"
 Angles: TypeAlias = "Mapping[str, float] | Sequence[str] | None"
@@ -58,7 +58,7 @@ def fit_of(given: Any) -> Any:
     return after if isinstance(after, Fitted) else given
 
 
-def calibration_of(given: Product, effects: Effects = None) -> Calibration:
+def calibration_of(given: CalibrationLike, effects: Effects = None) -> Calibration:
     """A calibration as given, of a fit or a diagnosis, or read from a product or run (`DataError` if it cannot be)."""
     from walop_jax.calibration.calibration import Calibration
     from walop_jax.calibration.product import read_calibration

@@ -19,9 +19,9 @@ from walop_jax.commands.command import (
     write_text,
 )
 from walop_jax.commands.products import (
+    CalibrationLike,
     Effects,
     InstrumentLike,
-    Product,
     calibration_of,
     catalogue_of,
     design_of,
@@ -85,7 +85,7 @@ def simulate(
     instrument: InstrumentLike = None,
     effect: str | Sequence[str | Effect] | Mapping[str, Any] | None = None,
     effects: Effects = None,
-    like: Simulated | Product | None = None,
+    like: Simulated | CalibrationLike | None = None,
     night: int | None = None,
     truth: PathLike | None = None,
     stars: int | None = None,

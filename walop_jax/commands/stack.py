@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, UsageError, after_fit, command, several
-from walop_jax.commands.products import Effects, Product, calibration_of, catalogue_of, fit_of
+from walop_jax.commands.products import CalibrationLike, Effects, calibration_of, catalogue_of, fit_of
 from walop_jax.io.names import CLIPPED, NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def stack(
     nights: Any,
     laws: Any = None,
     *,
-    like: Product | None = None,
+    like: CalibrationLike | None = None,
     events: Any = None,
     no_breaks: bool = False,
     workers: int | None = None,

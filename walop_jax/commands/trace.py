@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from walop_jax.commands import products
 from walop_jax.commands.command import Job, Option, Outcome, UsageError, command
-from walop_jax.commands.products import Angles, Effects, InstrumentLike, Product, design_of
+from walop_jax.commands.products import Angles, CalibrationLike, Effects, InstrumentLike, design_of
 
 if TYPE_CHECKING:
     from walop_jax import Instrument
@@ -35,7 +35,7 @@ OPTIONS = {
 @command(options=OPTIONS)
 def trace(
     job: Job,
-    calibration: Product | Instrument | None = None,
+    calibration: CalibrationLike | Instrument | None = None,
     *,
     instrument: InstrumentLike = None,
     effects: Effects = None,
