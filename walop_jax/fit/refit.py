@@ -220,6 +220,14 @@ class FitResult(Fitted):
         doubts = _against(self, (), examined=False, noiseless=False)
         return tuple(doubt.sentence for doubt in doubts if doubt.sentence)
 
+    def residuals(self) -> Float[np.ndarray, "p e k"]:
+        """(measured − model)/σ of every intensity (field point, exposure, camera), fluxes eliminated; 0 where unused.
+
+        >>> result.residuals().shape
+        (29, 14, 4)
+        """
+        return self.likelihood.residuals(self.values)[1]
+
     def value(self, name: str) -> tuple[float, float]:
         """Value and standard error of a parameter."""
         return self[name][:2]
