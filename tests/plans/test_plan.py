@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from own_instrument import OWN
+from small_run import SMALL as SMALL_RUN
 from small_run import small_fit
 
 import walop_jax as walop
@@ -29,9 +30,17 @@ from walop_jax.likelihood.flux import Sharing
 from walop_jax.likelihood.likelihood import prior_rows
 from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument
+from walop_jax.model.noise import with_noise
 from walop_jax.plans.available import Available, Costs, with_stops
 from walop_jax.plans.criteria import FieldErrors, criterion_by_name, field_errors
-from walop_jax.plans.exposures import Illumination, candidates, fewer_points, information_of, with_members
+from walop_jax.plans.exposures import (
+    Illumination,
+    candidates,
+    errors_of,
+    fewer_points,
+    information_of,
+    with_members,
+)
 from walop_jax.plans.plan import Line, _changes, plan_from
 from walop_jax.reports.page import kind_of_run, render_other
 from walop_jax.simulation.observing_plan import ObservingPlan, Stop, plan_text, read_plan
@@ -145,6 +154,35 @@ def test_errors_have_the_floor_of_the_instrument():
     assert information[0, 0, 0] == pytest.approx(2 * 200.0**2 - 40.0**2 / 0.52, rel=1e-12)
     gain = light.gain(np.array([[[0.6], [0.4]]]), np.array([[[1.0], [-1.0], [1.0]]]))
     assert gain == pytest.approx(information[0, 0], rel=1e-12)
+
+
+def test_errors_that_grow_with_the_light_are_those_of_the_cameras():
+    """By hand: counts 6·10⁵ and 4·10⁵; errors 2 √N beside 0.1 % of the counts in the second camera alone."""
+    errors = np.array([4.0, 4.0]), np.array([0.0, 1e-6])
+    light = Illumination(np.array([1e6]), PhotonNoise(1e-9), 0.0, Sharing(None), np.ones(1), errors=errors)
+    information = light.information(np.array([[[0.6, 0.4]]]), np.array([[[[1.0], [-1.0]]]]))
+    first, second = 1e12 / (4.0 * 6e5), 1e12 / (4.0 * 4e5 + 1e-6 * 1.6e11)
+    flux = (0.6 * first - 0.4 * second) ** 2 / (0.36 * first + 0.16 * second)
+    assert information[0, 0, 0] == pytest.approx(first + second - flux, rel=1e-9)
+    gain = light.gain(np.array([[[0.6], [0.4]]]), np.array([[[1.0], [-1.0], [1.0]]]))
+    assert gain == pytest.approx(information[0, 0], rel=1e-12)
+
+
+def test_errors_of_a_plan_are_those_that_a_fit_has_found():
+    calset = small_fit().calset
+    model = with_noise(base_model(calset), scale="clp", fraction="E1")
+    plain = Calibration.from_fit(small_fit())
+    values = np.append(plain.values, [1.5, 0.002])
+    covariance = np.zeros(2 * (len(values),))
+    covariance[:-2, :-2] = plain.covariance
+    known = dataclasses.replace(plain, model=model, values=values, covariance=covariance, hidden=None)
+    cameras = model.template.cameras.names
+    squared, added = errors_of(SMALL_RUN, "clp", cameras, known)
+    np.testing.assert_allclose(squared, 2.25)
+    np.testing.assert_allclose(added, [0.0, 4e-6, 0.0, 0.0])
+    assert errors_of(SMALL_RUN, "moon", cameras, known)[0].tolist() == [1.0] * 4
+    rough = dataclasses.replace(SMALL_RUN, noise_scale=2.0, noise_fraction=0.001)
+    assert errors_of(rough, "moon", cameras, None)[0].tolist() == [4.0] * 4
 
 
 def test_a_plan_is_proven_and_reads_back(planned, tmp_path):

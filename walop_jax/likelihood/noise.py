@@ -48,14 +48,20 @@ class NoiseTerms(NamedTuple):
         return cls(members(noise.scales), members(noise.fractions))
 
 
+def factors(noise: Noise, terms: NoiseTerms) -> tuple[Float[Any, "e k"], Float[Any, "e k"]]:
+    """s² and f² of every exposure and camera: σ² = s² N_ERR² + f² N². Numpy where the values of the terms are."""
+    xp = namespace(noise.scale, noise.fraction)
+    scale, fraction = xp.asarray(noise.scale), xp.asarray(noise.fraction)
+    squared = xp.prod(xp.where(xp.asarray(terms.scale) > 0, (scale**2)[:, None, None], 1.0), axis=0)
+    return squared, xp.einsum("f,fek->ek", fraction**2, xp.asarray(terms.fraction))
+
+
 def variance_ratio(
     noise: Noise, terms: NoiseTerms, counts: Float[Any, "*p e k"], weight: Float[Any, "*p e k"]
 ) -> Float[Any, "*p e k"]:
     """ρ of intensities whose stated errors are 1/`weight`; 1 where the weight is 0 (unused). Numpy stays numpy."""
     xp = namespace(counts)
-    scale, fraction = xp.asarray(noise.scale), xp.asarray(noise.fraction)
-    squared = xp.prod(xp.where(xp.asarray(terms.scale) > 0, (scale**2)[:, None, None], 1.0), axis=0)
-    added = xp.einsum("f,fek->ek", fraction**2, xp.asarray(terms.fraction))
+    squared, added = (xp.asarray(factor) for factor in factors(noise, terms))
     return xp.where(weight > 0, squared + added * (counts * weight) ** 2, 1.0)
 
 

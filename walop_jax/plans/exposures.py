@@ -16,7 +16,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -29,6 +29,7 @@ from walop_jax.likelihood import engine
 from walop_jax.likelihood.flux import Sharing, project_flux
 from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
+from walop_jax.likelihood.noise import NoiseTerms, factors
 from walop_jax.model import light
 from walop_jax.model.cameras import with_floor
 from walop_jax.model.compiled import compiled
@@ -95,7 +96,8 @@ def candidates(
 ) -> Candidates:
     """The exposures that could be taken, each with its information in `draws` draws of the instrument.
 
-    Instruments are drawn from the priors, or from the posterior of the calibration `around`. `effects` of the
+    Instruments are drawn from the priors, or from the posterior of the calibration `around`. Errors of the data are as
+    its fit has found them, or those of the plan (`noise_scale`, `noise_fraction`). `effects` of the
     `catalogue` may be there as well, at their values; those given by name alone at the size of their scale. Raises
     ValueError where nothing is left to be observed, and for effects that do not act on light, or grow with time, hour
     angle or temperature.
@@ -136,7 +138,8 @@ def candidates(
         electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
         of_field = choice.kind == "standard" and plan.stops[rows.start].number == plan.standards
         scatter = plan.zero_scatter if of_field else 0.0
-        lit = Illumination(electrons, noise, floor, shared, weight[at], dict.fromkeys(means, scatter))
+        errors = errors_of(plan, choice.kind, model.template.cameras.names, around)
+        lit = Illumination(electrons, noise, floor, shared, weight[at], dict.fromkeys(means, scatter), errors)
         return lit, tuple((unit[at, rows], slopes[at, rows]) for unit, slopes in responses)
 
     families: list[Family] = []
@@ -253,12 +256,25 @@ def _even(count: int) -> Float[np.ndarray, " s"]:
     return 2 * np.pi * np.arange(count) / count
 
 
+def errors_of(
+    plan: ObservingPlan, kind: str, cameras: Sequence[str], around: Calibration | None
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """s² and f² of the cameras in exposures of a KIND: σ² = s² N_ERR² + f² N² (`model.noise`)."""
+    found = None if around is None else around.model.instrument(around.values).noise
+    if found is None:
+        every = np.ones(len(cameras))
+        return plan.noise_scale**2 * every, plan.noise_fraction**2 * every
+    squared, added = factors(found, NoiseTerms.of(found, [kind], cameras))
+    return np.asarray(squared)[0], np.asarray(added)[0]
+
+
 class Illumination(NamedTuple):
     """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
 
     No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `weight`
     is for how many points of the plan each of them stands. `scatter` is the rms of single stars around a parameter, by
-    its place; each exposure counts as one of other stars.
+    its place; each exposure counts as one of other stars. `errors` are s² and f² of the cameras in
+    σ² = s² N_ERR² + f² N².
     """
 
     flux: Float[np.ndarray, " p"]
@@ -267,6 +283,15 @@ class Illumination(NamedTuple):
     shared: Sharing
     weight: Float[np.ndarray, " p"]
     scatter: Mapping[int, float] = MappingProxyType({})
+    errors: tuple[Float[Any, " *k"], Float[Any, " *k"]] = (np.ones(()), np.zeros(()))
+
+    def sigma(self, counts: Float[np.ndarray, ...], axis: int) -> Float[np.ndarray, ...]:
+        """Errors of counts (electrons) whose cameras lie along an axis."""
+        shape = [1] * counts.ndim
+        shape[axis] = -1
+        squared, added = (np.reshape(factor, shape) for factor in self.errors)
+        stated = with_floor(self.noise.sigma(counts), counts, self.floor, axis)
+        return np.sqrt(squared * stated**2 + added * counts**2)
 
     def information(
         self, unit: Float[np.ndarray, "p s k"], slopes: Float[np.ndarray, "p s k f"]
@@ -274,7 +299,7 @@ class Illumination(NamedTuple):
         """JᵀJ of exposures, from counts of unit flux and their derivatives."""
         flux = self.flux[:, None, None]
         counts = flux * unit
-        weight = 1.0 / with_floor(self.noise.sigma(counts), counts, self.floor, 2)
+        weight = 1.0 / self.sigma(counts, 2)
         columns = np.moveaxis(slopes * (flux * weight)[..., None], -1, 0)
         projected = project_flux(columns, unit * weight, False, self.shared)
         if any(self.scatter.values()):
@@ -294,7 +319,7 @@ class Illumination(NamedTuple):
         Σ a², the sums over cameras with a flux in common (`likelihood.flux`).
         """
         counts, count = self.flux[:, None, None] * unit, unit.shape[1]
-        weight = 1.0 / with_floor(self.noise.sigma(counts), counts, self.floor, 1) ** 2
+        weight = 1.0 / self.sigma(counts, 1) ** 2
         weighted = unit * weight
         together = np.ones((count, count)) if self.shared.cameras is None else self.shared.cameras
         share = weighted / (together @ (unit * weighted))
