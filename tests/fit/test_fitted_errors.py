@@ -135,3 +135,16 @@ def test_many_fits_have_them_one_by_one():
     many = refit_many([calset, with_stated(calset, 0.5)], model)
     assert many.alone == (1,)
     assert many[1]["noise.scale"].value == pytest.approx(2.0 * many[0]["noise.scale"].value, rel=0.02)
+
+
+def test_whatever_asks_a_fit_for_its_points_gets_the_fitted_errors():
+    """Also where its likelihood is made anew, as for a sample of its points."""
+    found = fitted(with_stated(small_fit().calset, 0.5), scale="all")
+    again = dataclasses.replace(found, likelihood=Likelihood.of(found.calset, found.model))
+    stated, used = found.likelihood.points_as_stated.gathered("weight"), found.likelihood.used
+    scale = found["noise.scale"].value
+    for one in (found, again):
+        np.testing.assert_allclose(
+            one.likelihood.points.gathered("weight")[used], stated[used] / scale, rtol=1e-12
+        )
+    np.testing.assert_array_equal(again.residuals(), found.residuals())

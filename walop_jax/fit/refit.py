@@ -92,6 +92,11 @@ class FitResult(Fitted):
     alternatives: Alternatives | None = None
     clipped: Clipped | None = None
 
+    def __post_init__(self) -> None:
+        # Whatever asks the likelihood of a fit for its points gets the errors that were fitted.
+        if self.likelihood.fits_errors:
+            object.__setattr__(self, "likelihood", self.likelihood.with_errors_at(self.values))
+
     @classmethod
     def of(cls, likelihood: Likelihood, *, noise_scale: float | None = None) -> FitResult:
         """The fit of a likelihood, as `fit` makes it: its residuals are not examined, its errors are as stated.
