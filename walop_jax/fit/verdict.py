@@ -76,7 +76,7 @@ REMEDIES: Mapping[Quality, str] = {
     Quality.DOUBTED: "walop-jax diagnose looks for the cause",
     Quality.ERRORS_TOO_LARGE: "check the gain, and whether N_ERR holds variances or other units",
     Quality.AT_PRIOR_EDGE: "walop-jax diagnose looks for what pulls at it",
-    Quality.CLASS_ONLY: "walop-jax plan RUN --criterion apart gives the exposures that separate the class",
+    Quality.CLASS_ONLY: "walop-jax plan --separate RUN plans the exposures that decide between its members",
     Quality.FREE_FORM: "walop-jax report RUN shows the pattern; describe its cause in an --effects file",
     Quality.ILL_CONDITIONED: "walop-jax plan names the exposures that separate the parameters",
 }
