@@ -303,7 +303,7 @@ def detection_limits(
     """Detection limits of the data behind a fit for each effect of `catalogue`, and undetectable effects.
 
     The residuals of the fit are not used: a fit to noiseless counts of a plan serves as well. `seed` is that of the
-    Monte Carlo threshold. Of a large set points spread over the field are looked at, as in `diagnose`.
+    Monte Carlo threshold. Of a large set points spread over the field are looked at, or joined cells, as in `diagnose`.
     """
     tell = progress or (lambda text: None)
     template, calset = result.model.template, result.calset

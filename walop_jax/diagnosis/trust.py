@@ -23,7 +23,7 @@ Symbols     w = expected counts / errors of all with a flux in common (an exposu
             that was fitted (0 where it is known); Q orthonormal basis of the derivatives with respect to the free
             parameters.
 Sources     Rao 1948; Satterthwaite 1946, Biometrics Bull. 2, 110 (χ² with two moments); Šidák 1967 (many questions).
-Limits      Noise alone raises a doubt in about one fit of 100. Of a large set a sample of the points is looked at.
+Limits      Noise alone raises a doubt in about one fit of 100. Of a large table a sample of the points is looked at.
             What is finer than the cells of whole frames was measured when these were read (`data.cells`).
 """
 
@@ -38,6 +38,8 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import special
 
+from walop_jax.data.joined_cells import joined_cells
+from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
 from walop_jax.diagnosis.discrete import refuse_mixups
@@ -87,7 +89,9 @@ def examined(
     A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
     tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
     `candidates` the scores of its residuals in a diagnosis, if there was one.
-    Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at.
+    Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at; cells of
+    whole frames are joined to so many (`joined_cells`), and those spread over the field are asked what differs between
+    places.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
     standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
     explains.
@@ -107,7 +111,11 @@ def examined(
     design = Design.of(seen)
     if result.errors_too_large and _hold_no_noise(design):
         return result.judged(noiseless=True)
-    components = found_components(variance_components(design))
+    places = design if seen is result or result.calset.fine is None else Design.of(_spread(result))
+    asked = [c for c in variance_components(design) if places is design or not c.grouping.structure]
+    if places is not design:
+        asked += variance_components(places, structure_alone=True)
+    components = found_components(asked)
     hidden = singles = None
     if near:
         singles = Singles.of(design)
@@ -134,7 +142,7 @@ def examined(
     structure = structure_of(components)
     final = with_honest_errors(result)
     if structure:
-        final = with_structure(final, design, components, len(result.calset.points))
+        final = with_structure(final, places, components, len(result.calset.points))
     final = final.judged(doubts, structure=_with_finer(result, structure))
     if unseen := hidden.not_measured() if hidden is not None else ():
         final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
@@ -254,11 +262,24 @@ def _hold_no_noise(design: Design) -> bool:
 
 
 def sampled(result: FitResult, most: int = 0) -> FitResult:
-    """The fit seen at no more than `most` field points (0: those of `TRUST_ROWS`), spread over the field."""
-    most = most or max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
-    if len(result.calset.points) <= most:
+    """The fit seen at about `most` field points (0: those of `TRUST_ROWS`): all cells, joined, or points of a table."""
+    if result.calset.fine is None:
+        return _spread(result, most)
+    return _seen_at(result, joined_cells(result.calset, most or _most(result)))
+
+
+def _spread(result: FitResult, most: int = 0) -> FitResult:
+    """The fit seen at no more than `most` field points, spread over the field."""
+    return _seen_at(result, thinned(result.calset, most or _most(result), neighbours=1))
+
+
+def _most(result: FitResult) -> int:
+    return max(1, TRUST_ROWS // max(len(result.calset.exposures), 1))
+
+
+def _seen_at(result: FitResult, calset: CalibrationSet) -> FitResult:
+    if calset is result.calset:
         return result
-    calset = thinned(result.calset, most, neighbours=1)
     return dataclasses.replace(result, likelihood=Likelihood.of(calset, result.model))
 
 

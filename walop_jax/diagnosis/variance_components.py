@@ -92,11 +92,12 @@ class VarianceComponent(NamedTuple):
     error: float
 
 
-def variance_components(design: Design) -> list[VarianceComponent]:
-    """Every grouping that the data have, asked by itself."""
+def variance_components(design: Design, *, structure_alone: bool = False) -> list[VarianceComponent]:
+    """Every grouping that the data have, asked by itself; those of single field points alone where that is said."""
     residual = design.projector(design.residual)
     square = float(residual @ residual)
     grouped = groupings(design) if square > 0 else ()
+    grouped = (grouping for grouping in grouped if grouping.structure or not structure_alone)
     ready = (asked(design, grouping, residual[:, None]) for grouping in grouped)
     return [question.answered(pull[:, 0], square) for question, pull in filter(None, ready)]
 

@@ -21,6 +21,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
+from walop_jax.data.joined_cells import joined_cells
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import Classes, only_a_class, with_average
@@ -68,20 +69,27 @@ def diagnose(
 
     `catalogue` are the effects that may be named (default: those of the model). Of a set with more than
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
-    points spread over the field are looked at. Nothing further is tried after `thresholds.MOST_FITS` fits of additions
-    (fewer where the model is far from the data), nor after `minutes`, if given; what is left then has no name, and
-    `Diagnosis.caution` says so. Both fits are examined. Other readings of the data are not tried where the caller has
-    done that already (`as_written`). Raises what `fit` raises, and `DataError` for data that another reading explains
-    (`readings`).
+    points spread over the field are looked at; cells of whole frames are joined to so many. Nothing further is tried
+    after `thresholds.MOST_FITS` fits of additions (fewer where the model is far from the data), nor after `minutes`, if
+    given; what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the
+    data are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError`
+    for data that another reading explains (`readings`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
     model = model or base_model(calset)
     catalogue = known_effects(model) if catalogue is None else catalogue
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
-    sample = thinned(calset, most_points(calset, model.template, candidates.amplitudes), neighbours=1)
-    if len(sample.points) < len(calset.points):
-        tell(f"looking at {len(sample.points)} of {len(calset.points)} field points")
+    most, points = most_points(calset, model.template, candidates.amplitudes), len(calset.points)
+    if calset.fine is not None:
+        sample = joined_cells(calset, most)
+        points = len(sample.points)
+        what = f"joining {len(calset.points)} cells to {points} field points"
+    else:
+        sample = thinned(calset, most, neighbours=1)
+        what = f"looking at {len(sample.points)} of {points} field points"
+    if sample is not calset:
+        tell(what)
     tell(Stage("fitting the model", "fitting"))
     before = fit(Likelihood.of(sample, model))
     structural = [
@@ -137,7 +145,7 @@ def diagnose(
         before=before,
         after=after,
         seconds=time.perf_counter() - began,
-        points=len(calset.points),
+        points=points,
         # by the gain where it is known, then by the remaining χ²
         choices=tuple(
             sorted(state.choices.values(), key=lambda c: (-np.nan_to_num(c.better_by, nan=-np.inf), c.left))
