@@ -9,12 +9,14 @@ import pytest
 from changed_sets import block_of, with_block
 from frame_run import frame_run
 
+from walop_jax.data.joined_cells import joined_cells
 from walop_jax.data.records import FineStructure
-from walop_jax.diagnosis import trust
+from walop_jax.diagnosis import trust, workflow
 from walop_jax.diagnosis.design import Design, pattern_scores
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
+from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
@@ -54,3 +56,23 @@ def test_structure_of_places_is_that_of_single_cells():
     block = block_of(made)
     result = examined(fitted(with_block(made, counts=block.counts * gains)))
     assert result.verdict.structure.gain == pytest.approx(2e-3, rel=0.2)
+
+
+class SeenError(Exception):
+    pass
+
+
+def test_a_diagnosis_looks_at_joined_cells(monkeypatch):
+    calset = dataclasses.replace(simulate(RUN, seed=3).calset, fine=NOTHING)
+    monkeypatch.setattr(limits, "DIAGNOSED_ROWS", SEEN * len(calset.exposures))
+    told = []
+
+    def looked_at(likelihood):
+        expected = block_of(joined_cells(calset, SEEN))
+        np.testing.assert_array_equal(block_of(likelihood.calset).counts, expected.counts)
+        raise SeenError
+
+    monkeypatch.setattr(workflow, "fit", looked_at)
+    with pytest.raises(SeenError):
+        workflow.diagnose(calset, progress=told.append)
+    assert told[0] == "looking at 144 field points, joined from 900 cells"

@@ -325,10 +325,10 @@ class Diagnosis(Drawn):
             )
         looked_at = len(self.after.calset.points)
         if looked_at < self.points:
-            cautions.append(
-                f"{looked_at} of {self.points} field points were looked at, and fitted: refit all of them with the "
-                "model found"
-            )
+            what = f"{looked_at} of {self.points} field points were looked at"
+            if self.after.calset.fine is not None:
+                what = f"{looked_at} field points, joined from {self.points} cells, were looked at"
+            cautions.append(f"{what}, and fitted: refit all of them with the model found")
         if len(self.steps) > thresholds.MOST_SENTENCES:
             cautions.append(
                 f"{len(self.steps)} names were needed: something that is not in the catalogue can look like several "

@@ -80,16 +80,15 @@ def diagnose(
     model = model or base_model(calset)
     catalogue = known_effects(model) if catalogue is None else catalogue
     candidates = hypotheses(catalogue, model.template, calset.exposures, len(calset.points))
-    most, points = most_points(calset, model.template, candidates.amplitudes), len(calset.points)
-    if calset.fine is not None:
-        sample = joined_cells(calset, most)
-        points = len(sample.points)
-        what = f"joining {len(calset.points)} cells to {points} field points"
-    else:
+    most = most_points(calset, model.template, candidates.amplitudes)
+    if calset.fine is None:
         sample = thinned(calset, most, neighbours=1)
-        what = f"looking at {len(sample.points)} of {points} field points"
+        what = "looking at {} of {} field points"
+    else:
+        sample = joined_cells(calset, most)
+        what = "looking at {} field points, joined from {} cells"
     if sample is not calset:
-        tell(what)
+        tell(what.format(len(sample.points), len(calset.points)))
     tell(Stage("fitting the model", "fitting"))
     before = fit(Likelihood.of(sample, model))
     structural = [
@@ -145,7 +144,7 @@ def diagnose(
         before=before,
         after=after,
         seconds=time.perf_counter() - began,
-        points=points,
+        points=len(calset.points),
         # by the gain where it is known, then by the remaining χ²
         choices=tuple(
             sorted(state.choices.values(), key=lambda c: (-np.nan_to_num(c.better_by, nan=-np.inf), c.left))
