@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import tracemalloc
 
 import numpy as np
@@ -13,6 +14,9 @@ from frame_run import frame_run, raster
 from frames_file import write_frames
 
 import walop_jax as walop
+from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.product import write_calibration
+from walop_jax.calibration.summary import summary
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.cells import ORDER
 from walop_jax.data.grid import Grid
@@ -297,3 +301,18 @@ def test_pixels_are_read_piece_by_piece(tmp_path):
     tracemalloc.stop()
     assert len(cells.points) > 4000
     assert most < 0.25 * of_images
+
+
+def test_a_run_reads_its_frames_in_the_cells_of_its_fit(tmp_path):
+    """Twenty cells, told in summary.json: that many along a side when a later command asks for the data."""
+    path, folder = tmp_path / "frames.fits", tmp_path / "run"
+    write_frames(path, simulate(RUN, seed=12).calset, raster(RUN, SIDE))
+    calset = read_calibration_set(path, cells=20)
+    result = fit(Likelihood.of(calset, base_model(calset, throughput_degree=2))).judged()
+    folder.mkdir()
+    write_calibration(folder / "calibration.fits", Calibration.from_fit(result))
+    assert len(walop.read(folder).calset.points) == SIDE**2  # fewer pixels than the usual cells: each stays
+    (folder / "summary.json").write_text(json.dumps(summary(result, seconds=1.0), default=float))
+    again = walop.read(folder).calset
+    assert again.cells == 20
+    np.testing.assert_array_equal(block_of(again).counts, block_of(calset).counts)

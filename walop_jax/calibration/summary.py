@@ -45,6 +45,7 @@ def summary(
         "seconds": seconds,
         "versions": software_versions(),
         "inputs": [{"path": str(e.path), "sha256": e.sha256} for e in result.calset.inputs],
+        "cells": result.calset.cells,
         "trusted": verdict.trusted,
         "quality": int(verdict.quality),
         "doubts": list(verdict.doubts),

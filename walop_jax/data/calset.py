@@ -197,6 +197,7 @@ def assembled(
         intensities=intensities,
         remarks=tuple(remarks),
         fine=fine,
+        cells=cells if images else None,
         stated_errors=stated_errors or StatedErrors(),
     )
 

@@ -58,6 +58,7 @@ def merge_calibration_sets(*sets: CalibrationSet) -> CalibrationSet:
         inputs=tuple(entry_input for entry in sets for entry_input in entry.inputs),
         remarks=tuple(dict.fromkeys([remark for entry in sets for remark in entry.remarks] + remarks)),
         fine=FineStructure.joined(structures) if structures else None,
+        cells=next((entry.cells for entry in sets if entry.cells is not None), None),
         stated_errors=StatedErrors.largest(entry.stated_errors for entry in sets),
     )
 

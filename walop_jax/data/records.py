@@ -461,7 +461,8 @@ class CalibrationSet(Displayed):
     """A calibration set, read, checked and free of units.
 
     `intensities` gives the data of a slice of the points. `fine` is the structure that is finer than the cells of whole
-    frames, in a set that was made of these. `stated_errors` are those of the numbers of the set.
+    frames, in a set that was made of these, `cells` how many along their longer side were asked for. `stated_errors`
+    are those of the numbers of the set.
 
     >>> calset.instrument, len(calset.exposures), len(calset.points)
     ('WALOP-SOUTH', 14, 29)
@@ -478,6 +479,7 @@ class CalibrationSet(Displayed):
     inputs: tuple[InputFile, ...] = ()
     remarks: tuple[str, ...] = ()
     fine: FineStructure | None = None
+    cells: int | None = None
     stated_errors: StatedErrors = StatedErrors()
 
     @property

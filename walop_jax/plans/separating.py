@@ -122,9 +122,10 @@ def data_of(after: Any) -> CalibrationSet:
     if isinstance(after, Diagnosis):
         return after.before.calset
     folder = after if isinstance(after, RunFolder) else RunFolder(Path(os.fspath(after)))
-    inputs = folder.document(SUMMARY, ("inputs",))["inputs"]
+    fitted = folder.document(SUMMARY, ("inputs",))
+    inputs = fitted["inputs"]
     try:
-        calset = read_calibration_set(*(entry["path"] for entry in inputs))
+        calset = read_calibration_set(*(entry["path"] for entry in inputs), cells=fitted.get("cells"))
     except DataError as error:
         advice = "put the sets back where they were, or give the Diagnosis in Python"
         raise fail(f"the data of this run are needed: {error}", file=folder.folder, advice=advice) from None

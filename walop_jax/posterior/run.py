@@ -22,7 +22,7 @@ from walop_jax.fit.refit import FitResult, fit, with_honest_errors
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
-from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT
+from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT, SUMMARY
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.io.text import per_cent
 from walop_jax.likelihood import limits
@@ -98,7 +98,8 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             advice = "make it with walop-jax refit"
             raise fail("does not name the data of its fit", file=self.folder, advice=advice)
         paths = self.data or [self._located(entry.path) for entry in inputs]
-        calset = read_calibration_set(*paths, kinds=self.calibration.design.kinds)
+        cells = self.document(SUMMARY).get("cells") if SUMMARY in self else None
+        calset = read_calibration_set(*paths, kinds=self.calibration.design.kinds, cells=cells)
         if sorted(entry.sha256 for entry in calset.inputs) != sorted(entry.sha256 for entry in inputs):
             raise fail("these are not the data of the fit any more", file=inputs[0].path, advice="refit them")
         if CLIPPED not in self:
