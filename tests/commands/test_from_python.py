@@ -123,7 +123,8 @@ def test_matrix_is_the_table_of_the_command(call, fitted, tmp_path):
 
 def test_apply_is_the_table_of_the_command(call, fitted, tmp_path):
     n = np.array([[2.1e5, 1.9e5, 2e5, 2e5], [1.9e5, 2.1e5, 2e5, 2.1e5]])
-    errors = 10.0 * np.sqrt(n)  # stars of these counts contradict the calibration by more than noise of photons
+    # By photon noise alone, stars of these counts would contradict the calibration.
+    errors = 10.0 * np.sqrt(n)
     stars = Table({"X": [0.1, 0.2], "Y": [0.0, 0.1], "N": n, "N_ERR": errors})
     stars.write(tmp_path / "stars.fits")
     result = call("apply", fitted.run, tmp_path / "stars.fits", "-o", tmp_path / "out.fits", "--quiet")
