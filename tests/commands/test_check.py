@@ -117,7 +117,7 @@ def posterior(*, trusted: bool) -> PosteriorSample:
     """A posterior of one coefficient, typed by hand, around a fit that is trusted or not."""
     one, draws = np.ones(1), np.random.default_rng(0).standard_normal((1, 200, 1))
     return PosteriorSample(
-        sampler="emcee", names=("a",), units=("",), draws=draws, log_posterior=draws[..., 0], ln_f=None,
+        sampler="emcee", names=("a",), units=("",), draws=draws, log_posterior=draws[..., 0],
         mean=np.zeros(1), covariance=np.eye(1), chains=np.zeros((1, 1, 1, 1)), sampled=("a",), thin=1,
         convergence=Convergence(("a",), 10000, one, (1.0, 1.0, 1.0), 1e4 * one, one, 0, ()), accuracy=None,
         acceptance=0.5, counts={}, seconds=0.0, fingerprint={}, of_trusted_fit=trusted,

@@ -56,6 +56,28 @@ THREE = one_arm(
     degree=1,
 )  # fmt: skip
 PLAN = 'instrument = "three.toml"\ngrid = 2\npolariser_angles = 6\nmoon_patches = 0\nstandards = 0\n'
+ALONE = """
+from typer.testing import CliRunner
+
+import walop_jax as walop
+from walop_jax.commands.program import app
+
+held = walop.read("RUN").calibration
+print("unavailable|", held.unavailable)
+try:
+    held.matrix(0.0, 0.0)
+except walop.DataError as error:
+    print("matrix|", error)
+for line in (
+    ["matrix", "RUN", "--points", "p.csv", "-o", "alone.fits"],
+    ["apply", "RUN", "p.csv", "-o", "stars.fits"],
+    ["check", "RUN"],
+):
+    done = CliRunner().invoke(app, line)
+    told = done.stderr if done.exit_code == 1 else done.stdout
+    print(done.exit_code, told.splitlines()[0], sep="|")
+print(walop.Calibration.read("RUN", elements="grey.py")["grey.loss"].value)
+"""
 MISSPELT = "no part 'half2.plat'; did you mean 'plate'"
 
 
@@ -132,20 +154,15 @@ def test_what_is_fitted_with_an_element_of_ones_own_is_read(own: Path, call):
     ):
         done = call(*line, *with_class)
         assert done.exit_code == 0, f"{line}: {done.output}"
-    alone = (
-        "import walop_jax as walop\n"
-        "try:\n    walop.read('RUN').calibration\n"
-        "except walop.DataError as error:\n    print(error)\n"
-        "held = walop.Calibration.read('RUN', elements='grey.py')['grey.loss']\n"
-        "print(held.value)\n"
-    )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     told = subprocess.run(
-        [sys.executable, "-c", alone], capture_output=True, text=True, env=environment, check=True
+        [sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment, check=True
     )
-    said, value = told.stdout.splitlines()
-    assert "there is no kind of element 'grey_depolariser'" in said
-    assert "It is class Grey of grey.py: give --elements FILE.py, in Python elements=[CLASS]" in said
+    *said, value = told.stdout.splitlines()
+    assert [line.split("|")[0] for line in said] == ["unavailable", "matrix", "1", "1", "3"]
+    for line in said:
+        assert "there is no kind of element 'grey_depolariser'" in line
+        assert "It is class Grey of grey.py: give --elements FILE.py, in Python elements=[CLASS]" in line
     np.testing.assert_allclose(float(value), held["grey.loss"].value, rtol=1e-12)
 
 

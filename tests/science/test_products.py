@@ -8,15 +8,16 @@ import json
 import numpy as np
 import pytest
 from astropy.io import fits
+from calibration_in_words import changed as in_words
 from scipy import stats
 from small_run import SMALL, small_fit
 from typer.testing import CliRunner
 
 import walop_jax.science.epoch
 from walop_jax.calibration.accuracy import sample_stars
-from walop_jax.calibration.calibration import Calibration
+from walop_jax.calibration.calibration import Calibration, Written
 from walop_jax.calibration.certify import certify
-from walop_jax.calibration.product import validity, write_calibration
+from walop_jax.calibration.product import read_calibration, validity, write_calibration
 from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.base_model import base_model
@@ -67,7 +68,7 @@ def test_a_good_product_is_valid(product):
     assert known.mjd[0] == np.nanmin(product.exposures.mjd)
 
 
-def test_what_is_wrong_is_named(product):
+def test_what_is_wrong_is_named(product, tmp_path):
     def changed(**more):
         return dataclasses.replace(product, **more)
 
@@ -84,8 +85,13 @@ def test_what_is_wrong_is_named(product):
     assert "validity" in failed(changed(exposures=exposures))
     assert failed(changed(inputs=())) == ["parents"]
     maps = dataclasses.replace(product.maps, values=product.maps.values + 1e-5)
-    assert failed(changed(maps=maps)) == ["maps"]
-    assert failed(changed(model_lines=("[model]", 'effects = ["no_such"]'))) == ["model"]
+    written = Written(maps, product.model_lines, product.description)
+    assert failed(changed(written=written)) == ["maps"]
+    unknown = in_words(product, model_lines=("[model]", 'effects = ["no_such"]'))
+    write_calibration(tmp_path / "unknown.fits", unknown)
+    held = read_calibration(tmp_path / "unknown.fits", any_model=True)
+    assert failed(held) == ["model"]
+    assert "no_such" in str(held.unavailable)
     values = product.values.copy()
     values[product.names.index("half1.efficiency")] = 1.2  # analyses more light than there is
     assert "physics" in failed(changed(values=values))

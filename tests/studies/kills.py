@@ -37,8 +37,6 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from commands.conftest import content  # noqa: E402
-from frame_run import raster  # noqa: E402
-from frames_file import write_frames  # noqa: E402
 from small_run import SEED, SMALL  # noqa: E402
 from study_options import options_of  # noqa: E402
 
@@ -49,31 +47,22 @@ from walop_jax.commands.refit import refit  # noqa: E402
 from walop_jax.commands.sample import sample  # noqa: E402
 from walop_jax.data.write import write_calibration_set  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
-from walop_jax.likelihood import limits  # noqa: E402
 from walop_jax.model.compiled import switch_on  # noqa: E402
-from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
 DEAD = 4194303  # no process has this number
-COMMANDS = ("refit", "sample", "diagnose", "compress")
+COMMANDS = ("refit", "sample", "diagnose")
 OUTPUTS = {
     "refit": ("calibration.fits", "summary.json"),
     "sample": sampling.OUTPUTS,
     "diagnose": diagnosing.OUTPUTS,
-    "compress": ("set.fits",),
 }
 EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "os.chmod")
 LINES = {
     "refit": ("refit", "{set}", "-o", "{run}", "--overwrite"),
     "sample": ("sample", "{run}", "--overwrite", "--interval", "50", "--maximum-steps", "100", "--moves", "laplace"),
     "diagnose": ("diagnose", "{set}", "-o", "{run}", "--overwrite", "--minutes", "0"),
-    "compress": ("refit", "{set}", "-o", "{run}", "--compress", "{run}/set.fits", "--overwrite"),
 }  # fmt: skip
-SIDE = int(limits.LARGE_ABOVE**0.5) + 8  # pixels: frames so large are fitted by sums over cells
-FRAMES = ObservingPlan(
-    grid=SIDE, standard_grid=1, standards=0, unpolarised=0, moon_patches=3,
-    polariser_angles=polariser_turn(11, full_turn=True),
-)  # fmt: skip
 
 
 class Study:
@@ -83,10 +72,7 @@ class Study:
         self.command, self.outputs = command, OUTPUTS[command]
         self.sets = [folder / f"set{n}.fits" for n in range(2)]
         for seed, path in enumerate(self.sets, SEED):
-            if command == "compress":
-                write_frames(path, simulate(FRAMES, seed=seed).calset, raster(FRAMES, SIDE))
-            else:
-                write_calibration_set(path, simulate(SMALL, seed=seed).calset)
+            write_calibration_set(path, simulate(SMALL, seed=seed).calset)
         self.prepare(folder)
 
     def prepare(self, folder: Path) -> None:
@@ -96,8 +82,6 @@ class Study:
         self.run = self.here / "RUN"
         if self.command == "sample":
             refit(self.sets[1], output=self.run)
-        if self.command == "compress":
-            self.run.mkdir()
         self.do(0)
         self.before = folder / "before"
         shutil.copytree(self.here, self.before)
@@ -111,8 +95,6 @@ class Study:
             refit(self.sets[number], output=self.run, overwrite=True)
         elif self.command == "sample":
             sample(self.run, interval=50, maximum_steps=100, moves="laplace", seed=number, overwrite=True)
-        elif self.command == "compress":
-            refit(self.sets[number], compress=self.run / "set.fits", output=self.run, overwrite=True)
         else:
             diagnose(self.sets[number], output=self.run, overwrite=True, minutes=0.0)
 
