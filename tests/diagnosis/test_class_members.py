@@ -65,7 +65,7 @@ def test_the_product_lies_between_and_its_errors_hold_both(told):
     assert np.linalg.eigvalsh(product.covariance).min() > -1e-12
     sentence = " ".join(only_a_class(classes))
     assert "only a class of causes was named" in sentence
-    assert "plan --criterion apart" in sentence
+    assert "plan --separate RUN" in sentence
 
 
 def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):

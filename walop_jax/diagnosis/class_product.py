@@ -357,4 +357,4 @@ def _deciding(group: ClassOf) -> str:
     """Observations that would distinguish the members."""
     tests = [s.tested_by for member in group.members for total in member.sums for _, s in total[:1]]
     observations = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"
-    return f"what would decide: {observations}; walop-jax plan --criterion apart finds the exposures"
+    return f"what would decide: {observations}; walop-jax plan --separate RUN plans the exposures"
