@@ -141,7 +141,7 @@ def test_sets_are_read_with_the_kinds_of_exposures_of_the_calibration(command: s
 
 
 def test_a_run_reads_its_data_with_the_kinds_of_exposures_of_its_instrument(run, monkeypatch):
-    def read(*paths: Any, kinds: Any) -> Any:
+    def read(*paths: Any, kinds: Any, cells: Any) -> Any:
         raise Begun(", ".join(kinds))
 
     monkeypatch.setattr("walop_jax.posterior.run.read_calibration_set", read)

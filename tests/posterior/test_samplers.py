@@ -102,7 +102,7 @@ def test_a_sampler_of_ones_own_samples_the_surrogate(scene: Scene, tmp_path: Pat
 
 def test_what_is_no_sampler_is_refused_with_advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(
-        DataError, match="no sampler 'emce'; choose one of emcee, nuts, or give your own as FILE"
+        DataError, match="no sampler 'emce'; choose one of emcee, nuts, bootstrap, or give your own as FILE"
     ):
         Options(sampler="emce")
     with pytest.raises(DataError, match=r"nowhere\.py: there is no such file"):
