@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.polynomial.legendre import legvander
 
 from walop_jax.data import plausible
 from walop_jax.data.frames import Frames
@@ -46,12 +47,13 @@ CELLS = 80
 those of a fit to all pixels."""
 ORDER = 4
 """Points along a side of a block."""
+BRIGHT = 20.0
+"""Standard errors of the light of a pixel, or of a cell, above which shares of it are taken."""
 MAP = 16
 """Parts of a block, along a side, in which structure is measured."""
 
 _TOGETHER = 1 << 15  # pixels of a camera: their numbers stay in the cache of a processor
 _HUGE = 10.0  # times the median error in its block row: a mark of a bad pixel, and no error
-_BRIGHT = 20.0  # standard errors of the light of a pixel above which shares of it are taken
 _WHOLE = 0.2  # smallest eigenvalue of the normal matrix, 1 with all pixels, of a block with all of its points
 _SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a block hold
 _FEW = 0.05  # of the patches of a row of blocks: with more of them spots are no spots, and stay
@@ -59,6 +61,19 @@ _ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it 
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
 
 Vector = Float[np.ndarray, " n"]
+
+
+def orthonormal(
+    places: Vector, order: int, weight: Vector | None = None
+) -> tuple[Float[np.ndarray, " o"], Float[np.ndarray, "o o"]]:
+    """The polynomials of degrees 0 to `order` − 1 that are orthonormal over places between −1 and 1.
+
+    `weight` is that of each place; None: 1. Returns the zeros of the next polynomial, and the matrix that makes the
+    polynomials of Legendre's: `legvander(x, order - 1) @ matrix`.
+    """
+    plain = legvander(places, order - 1)
+    values, triangle = np.linalg.qr(plain if weight is None else np.sqrt(weight)[:, None] * plain)
+    return np.linalg.eigvalsh(values.T @ (places[:, None] * values)), np.linalg.inv(triangle)
 
 
 class _Side:
@@ -72,12 +87,11 @@ class _Side:
         blocks = pixels if pixels <= cells else max(1, round(cells / ORDER))
         self.edges = np.round(np.linspace(0, pixels, blocks + 1)).astype(int)
         self.order = min(ORDER, int(np.diff(self.edges).min()))
-        self.nodes, self.offsets, self._triangles = [], [], []
+        self.nodes, self.offsets, self._matrices = [], [], []
         for first, last in self:
             t = self._scaled(first, last, np.arange(first, last))
-            values, triangle = np.linalg.qr(np.vander(t, self.order, increasing=True))
-            self._triangles.append(np.linalg.inv(triangle))
-            zeros = np.linalg.eigvalsh(values.T @ (t[:, None] * values))
+            zeros, matrix = orthonormal(t, self.order)
+            self._matrices.append(matrix)
             self.nodes.append(0.5 * (first + last - 1 + zeros * (last - first)))
             self.offsets.append(np.round(np.linspace(0, last - first, self.order + 1)).astype(int))
 
@@ -94,9 +108,7 @@ class _Side:
     def polynomials(self, block: int, pixel: np.ndarray) -> Float[np.ndarray, "n o"]:
         """The polynomials of a block at places along the side."""
         first, last = self.edges[block : block + 2].tolist()
-        return (
-            np.vander(self._scaled(first, last, pixel), self.order, increasing=True) @ self._triangles[block]
-        )
+        return legvander(self._scaled(first, last, pixel), self.order - 1) @ self._matrices[block]
 
     def of_pixels(self, block: int) -> Float[np.ndarray, "n o"]:
         """The polynomials of a block at its pixels."""
@@ -297,7 +309,7 @@ class _Binning:
         number, light, variance = (
             np.add.reduceat(values.sum(axis=0, dtype=float), starts) for values in (used, total, noise)
         )
-        bright = light > _BRIGHT * np.sqrt(np.maximum(number * variance, 1e-300))
+        bright = light > BRIGHT * np.sqrt(np.maximum(number * variance, 1e-300))
         least = np.repeat(np.where(bright, 0.01 * light / np.maximum(number, 1.0), 0.0), widths)
         return np.where(used & np.repeat(bright, widths), np.maximum(total, least), 1.0)
 

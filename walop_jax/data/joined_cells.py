@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.polynomial.legendre import legvander
 
+from walop_jax.data.cells import BRIGHT, orthonormal
 from walop_jax.data.records import Block, CalibrationSet, Points
 from walop_jax.data.table_intensities import ONE_CAMERA, TableIntensities
 
@@ -40,7 +41,6 @@ LOWEST = 4
 
 _COMMON = 0.05  # of the cells: choices of exposures that fewer of them have are gaps of another choice
 _ALIKE = 0.5  # of the exposures of a cell: with fewer in common it is no cell of that raster
-_BRIGHT = 20.0  # standard errors of the light of a cell above which shares of it are taken
 _SAME = 1e-6  # of a side: cells nearer than that lie in the same column, or row
 _HELD = 0.2  # smallest eigenvalue of the normal matrix, 1 with all cells, of an exposure that has gaps
 
@@ -150,10 +150,9 @@ class _Side(NamedTuple):
         """For cells at these places along the side, with weights of sum 1."""
         middle, half = 0.5 * (places.min() + places.max()), 0.5 * np.ptp(places)
         t = (places - middle) / half
-        plain = legvander(t, order - 1)
-        whole, triangle = np.linalg.qr(np.sqrt(weight)[:, None] * plain)
-        zeros, inverse = np.linalg.eigvalsh(whole.T @ (t[:, None] * whole)), np.linalg.inv(triangle)
-        return cls(middle + half * zeros, plain @ inverse, legvander(zeros, order - 1) @ inverse)
+        zeros, matrix = orthonormal(t, order, weight)
+        at_cells, at_points = (legvander(places, order - 1) @ matrix for places in (t, zeros))
+        return cls(middle + half * zeros, at_cells, at_points)
 
 
 def _joined(block: Block, rectangle: _Rectangle, shared: Bool[np.ndarray, " e"]) -> Block | None:
@@ -161,7 +160,7 @@ def _joined(block: Block, rectangle: _Rectangle, shared: Bool[np.ndarray, " e"])
     here, shape = _some(block, rectangle.cells), (len(rectangle.y), len(rectangle.x))
     used, measured = here.used, here.used[..., None]
     total, noise = here.counts.sum(axis=2), np.sqrt(np.sum(here.sigma**2, axis=2))
-    bright = ~shared & ((total > _BRIGHT * noise) | ~used).all(axis=0)
+    bright = ~shared & ((total > BRIGHT * noise) | ~used).all(axis=0)
     light = np.where(bright & used, total, 1.0)
     share = np.where(measured, here.counts / light[..., None], 0.0)
     variance = np.where(measured, (here.sigma / light[..., None]) ** 2, 0.0)

@@ -8,7 +8,7 @@ import functools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -379,6 +379,15 @@ class Sources:
         return {name.upper(): getattr(self, name) for name in names if not absent.get(name)}
 
 
+Arrays = TypeVar("Arrays")
+
+
+def _one_after_the_other(kind: type[Arrays], parts: Sequence[Arrays]) -> Arrays:
+    """A record of arrays whose arrays are those of some parts, joined along their first axis."""
+    names = [field.name for field in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
+    return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
 @dataclasses.dataclass(frozen=True)
 class Block:
     """Intensities of some field points in all exposures, dense: the input of the likelihood.
@@ -397,8 +406,7 @@ class Block:
     @classmethod
     def joined(cls, blocks: Sequence[Block]) -> Block:
         """The field points of some blocks, one after the other."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: np.concatenate([getattr(block, name) for block in blocks]) for name in names})
+        return _one_after_the_other(cls, blocks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -426,8 +434,7 @@ class FineStructure:
     @classmethod
     def joined(cls, parts: Sequence[FineStructure]) -> FineStructure:
         """The patches of several files."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+        return _one_after_the_other(cls, parts)
 
     @functools.cached_property
     def _usual(self) -> tuple[float, float]:
