@@ -25,12 +25,10 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.findings import Diagnosis
-from walop_jax.io.errors import DataError, fail
-from walop_jax.io.names import SUMMARY
+from walop_jax.io.errors import fail
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
@@ -41,14 +39,13 @@ from walop_jax.model.specification import Model
 from walop_jax.plans.criteria import effects_alike
 from walop_jax.plans.exposures import Candidates, with_members
 from walop_jax.plans.optimal import Experiment, Key, Weights
+from walop_jax.posterior.run import Run
 
 DECIDED = thresholds.SEPARATION**2
 """Δχ² from which a rival is excluded."""
 STEPS = 4  # of the grid of the polariser, from one angle that is tried at first to the next
-_FIRSTS, _PROMISING = (
-    4,
-    8,
-)  # exposures that are tried as the first of two, and pairs in several shares of the time
+_FIRSTS = 4  # exposures that are tried as the first of two
+_PROMISING = 8  # pairs that are tried in several shares of the time
 _SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)  # of the time for the first of two exposures
 _WORTH = 1.02  # times the least Δχ² of one exposure that a second one has to bring
 _INFORMED = 1e-12  # share of the largest eigenvalue from which a direction is informed
@@ -118,22 +115,14 @@ def class_of_run(after: Any, known: Calibration) -> ClassOfRun:
 
 
 def data_of(after: Any) -> CalibrationSet:
-    """The data of a diagnosis, those of a folder read again. Raises `DataError` where they are not what they were."""
+    """The data of a diagnosis, those of a folder read again (`Run.calset`).
+
+    Raises `DataError` where they cannot be found or are not what they were.
+    """
     if isinstance(after, Diagnosis):
         return after.before.calset
-    folder = after if isinstance(after, RunFolder) else RunFolder(Path(os.fspath(after)))
-    fitted = folder.document(SUMMARY, ("inputs",))
-    inputs = fitted["inputs"]
-    try:
-        calset = read_calibration_set(*(entry["path"] for entry in inputs), cells=fitted.get("cells"))
-    except DataError as error:
-        advice = "put the sets back where they were, or give the Diagnosis in Python"
-        raise fail(f"the data of this run are needed: {error}", file=folder.folder, advice=advice) from None
-    for entry, read in zip(inputs, calset.inputs, strict=True):
-        if entry["sha256"] != read.sha256:
-            advice = "run diagnose again"
-            raise fail("is not the set that was diagnosed: its bytes differ", file=read.path, advice=advice)
-    return calset
+    folder = after.folder if isinstance(after, RunFolder) else Path(os.fspath(after))
+    return Run(folder).calset
 
 
 def information_of_data(of: ClassOfRun, found: Candidates) -> Information:
