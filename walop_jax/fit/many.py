@@ -166,6 +166,20 @@ def refit_many(
     Raises `DataError` for no sets, for a set of another layout than the first one (with its position), for another
     number of models than of sets, and for whole frames; ValueError where exposures cannot determine the instrument.
     """
+
+    def tell(done: int, of: int) -> None:
+        if progress is not None:
+            progress(f"{done} of {of} fits have ended")
+
+    return fitted_together(calsets, model, tell)
+
+
+def fitted_together(
+    calsets: Sequence[CalibrationSet],
+    model: Model | Sequence[Model] | None,
+    tell: Callable[[int, int], None],
+) -> ManyFits:
+    """The work of `refit_many`; `tell` hears how many fits have ended, and of how many."""
     began = time.perf_counter()
     if not calsets:
         raise fail("there are no sets to fit", advice="give at least one calibration set")
@@ -192,7 +206,7 @@ def refit_many(
         if n > 0
     }
     results, alone = [first], []
-    for n, minimum in sorted(_driven(searches, stack, likelihoods, censuses, progress).items()):
+    for n, minimum in sorted(_driven(searches, stack, likelihoods, censuses, tell).items()):
         if _is_of_a_single_fit(likelihoods[n], minimum):
             results.append(fit_at(likelihoods[n], minimum, 0.0))
         else:
@@ -223,14 +237,13 @@ def _driven(
     stack: Stack,
     likelihoods: Sequence[Likelihood],
     censuses: Sequence[Census],
-    progress: Callable[[str], None] | None,
+    tell: Callable[[int, int], None],
 ) -> dict[int, Minimum[Expansion]]:
     """The minima of searches by their position."""
     found: dict[int, Minimum[Expansion]] = {}
     places = {n: next(search) for n, search in searches.items()}
     while places:
-        if progress is not None:
-            progress(f"{len(found)} of {len(searches)} fits have ended")
+        tell(len(found), len(searches))
         numbers = list(places)
         values = np.stack([likelihoods[n].model.full(places[n]) for n in numbers])
         expansions = _expansions(stack, likelihoods, censuses, numbers, values)

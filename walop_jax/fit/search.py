@@ -93,10 +93,11 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
     Scales begin where they would make χ²/dof of the residuals 1.
     """
     model, expansion, start = likelihood.model, best.expansion, best.x.copy()
-    at = model.positions(NOISE)
+    noise, at = model.template.noise, model.positions(NOISE)
+    assert noise is not None
     start[at] = first[at]
-    for i in at:
-        if model.names[i].startswith("noise.scale") and model.parameters[i].free:
+    for i in at[: len(noise.scales)]:  # scales stand ahead of fractions
+        if model.parameters[i].free:
             start[i] *= np.sqrt(expansion.misfit)
     rows, select = likelihood.priors, model.selection()
     known = np.zeros((len(first), len(first)))

@@ -144,7 +144,7 @@ def _slopes(
 ) -> Float[np.ndarray, "t p e k"]:
     """α = ∂ ln σ/∂v of every term; `relative` is N/N_ERR."""
     scale, fraction = np.asarray(noise.scale), np.asarray(noise.fraction)
-    squared = np.prod(np.where(terms.scale > 0, (scale**2)[:, None, None], 1.0), axis=0)
+    squared = np.asarray(factors(noise, terms)[0])
     of_scale = [member * squared / value / ratio for member, value in zip(terms.scale, scale, strict=True)]
     of_fraction = [
         member * value * relative**2 / ratio for member, value in zip(terms.fraction, fraction, strict=True)

@@ -95,11 +95,11 @@ def with_noise(model: Model, *, scale: str | Sequence[str] = (), fraction: str |
     noise = Noise.of(_groups("scale", scale, model.template), _groups("fraction", fraction, model.template))
     template = dataclasses.replace(model.template, noise=noise if noise.scales or noise.fractions else None)
     kept = {p.name: p for p in model.parameters if p.part != NOISE}
-    parameters = []
-    for p in make_model(model.name, template).parameters:
-        if p.part == NOISE and p.name.startswith("noise.fraction"):
-            p = dataclasses.replace(p, prior=(0.0, p.width))
-        parameters.append(kept.get(p.name, p))
+    made = make_model(model.name, template)
+    parameters = [kept.get(p.name, p) for p in made.parameters]
+    for i in made.positions(NOISE)[len(noise.scales) :]:
+        # A fraction starts above 0, where the likelihood has a slope; its prior is centred on none.
+        parameters[i] = dataclasses.replace(parameters[i], prior=(0.0, parameters[i].width))
     return dataclasses.replace(model, template=template, parameters=tuple(parameters))
 
 

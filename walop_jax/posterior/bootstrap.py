@@ -20,7 +20,7 @@ import numpy as np
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.fit.many import refit_many
+from walop_jax.fit.many import fitted_together
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
@@ -91,7 +91,7 @@ def bootstrapped(
 ) -> PosteriorSample:
     """The posterior by fits to simulated sets; `tell` hears the fraction that is done.
 
-    Raises `DataError` as `refit_many` does, and for fewer than two sets.
+    Raises `DataError` as `refit_many` does, and for fewer than four sets.
     """
     began, count = time.perf_counter(), min(sampler.refits, options.maximum_steps)
     if count < 2 * ENSEMBLES:
@@ -99,12 +99,7 @@ def bootstrapped(
     rng = np.random.default_rng([options.seed, 30])
     sets = [simulated_like(result, rng) for _ in range(count)]
     models = [with_priors_drawn(result.model, result.values, rng) for _ in range(count)]
-
-    def heard(text: str) -> None:
-        done = text.partition(" ")[0]
-        tell(float(done) / count if done.isdigit() else 0.0)
-
-    fits = refit_many(sets, models, progress=heard)
+    fits = fitted_together(sets, models, lambda done, of: tell(done / of))
     values = fits.values[fits.converged]
     kept = values[: len(values) // ENSEMBLES * ENSEMBLES].reshape(ENSEMBLES, -1, values.shape[1])
     target = Target(result)

@@ -231,13 +231,14 @@ def sample(
     return dataclasses.replace(finished, of_trusted_fit=trusted, fit=fit, fingerprint=marks)
 
 
-def _by_refits(result: FitResult, options: Options, sampler: Any, report: Report) -> PosteriorSample:
+def _by_refits(
+    result: FitResult, options: Options, sampler: Any, report: Callable[[Progress], None]
+) -> PosteriorSample:
     """The posterior by fits to simulated sets (`posterior.bootstrap`)."""
     from walop_jax.posterior.bootstrap import bootstrapped
 
     def tell(share: float) -> None:
-        if report is not None:
-            report(Progress("fitting simulated sets", share))
+        report(Progress("fitting simulated sets", share))
 
     found = bootstrapped(result, options, sampler, tell)
     fit = digest_of_fit(result.calset.inputs, result.model.names, result.values)
