@@ -86,7 +86,7 @@ def calibration(instrument) -> Calibration:
         filters=("SDSS-r",), moving={"FLC": VOLTS},
     )  # fmt: skip
     calset = simulate(plan, seed=3).calset
-    return Calibration.from_fit(refit(calset, base_model(calset, instrument)).judged())
+    return Calibration.from_fit(refit(calset, base_model(calset, instrument)).with_verdict())
 
 
 def retarder_by_hand(volt: float, base: float = BASE, slope: float = SLOPE, axis: float = AXIS) -> np.ndarray:

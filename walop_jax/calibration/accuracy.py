@@ -17,7 +17,9 @@ GOAL = 0.001
 """Error of p that instruments are built for."""
 SMALLEST_DETERMINANT = 0.1
 """|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
-SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
+SHARE = (
+    0.95  # of the field where one exposure measures u: the part that the verdict on a calibration is about
+)
 SIZE = 21  # points along each axis of a map of the field
 NODES = (10, 14, 20, 28)
 _ROUNDING = 1e-12  # of q and u: what the rounding of matrices may make of nothing
@@ -66,8 +68,11 @@ def reached(error: Float[np.ndarray, "*p"]) -> float:
     return float(np.quantile(error, SHARE)) if error.size else np.nan
 
 
-def judged(without_u: float) -> str:
-    """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
+def field_measured(without_u: float) -> str:
+    """The part of the field that `reached` is about, in words: "95 % of the field" where every exposure measures u.
+
+    `without_u` is the fraction of the field, 0 to 1, in which one exposure does not measure u; it is left out.
+    """
     field = f"{100 * SHARE:.0f} % of the field"
     return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 

@@ -198,7 +198,7 @@ class Calibration(Fitted):
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=result.expansion.census.field,
+            field=result.expansion.used_data.field,
             inputs=calset.inputs,
             residuals=residuals,
             hidden=result.hidden,

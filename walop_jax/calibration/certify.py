@@ -79,7 +79,7 @@ def _verdict(calibration: Calibration) -> list[Check]:
     v, bits = calibration.verdict, calibration.verdict.quality
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
-    why = [doubt.sentence for doubt in v.against if doubt.blocking and doubt.sentence]
+    why = [doubt.sentence for doubt in v.doubts if doubt.blocking and doubt.sentence]
     evidence = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else why[:1]))
     return [
         Check("converged", v.converged and not bits & Quality.NOT_CONVERGED, reached),

@@ -97,7 +97,7 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
         return ()
     acting, mistakes = acting_effects(calibration), list[CouldHide]()
     at_values = calibration.model.instrument(calibration.values)
-    for number, (m, of_field) in enumerate(zip(hidden.mistakes, errors, strict=True)):
+    for number, (m, of_field) in enumerate(zip(hidden.errors, errors, strict=True)):
         ahead = not m.measured and number in acting and is_ahead(at_values, acting[number])
         error = float(np.median(of_field)), float(of_field.max())
         if error[1] > 0.0:
@@ -140,7 +140,7 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     context = effect_context(model.template, calibration.exposures)
     names = {kind.name for kind in known_effects(model)}
     effects = {}
-    for number, mistake in enumerate(() if hidden is None else hidden.mistakes):
+    for number, mistake in enumerate(() if hidden is None else hidden.errors):
         values: dict[str, Any] = json.loads(mistake.acts) if mistake.acts else {}
         if (name := values.pop("effect", "")) in names:
             effects[number] = effect_by_name(name, known_effects(model)).of(context, **values)

@@ -30,7 +30,7 @@ def summary(
     verdict = result.checked_verdict()
     mistakes, keys = None, ("name", "size", "unit", "kind", "measured")
     if result.hidden is not None:
-        mistakes = [{key: getattr(mistake, key) for key in keys} for mistake in result.hidden.mistakes]
+        mistakes = [{key: getattr(mistake, key) for key in keys} for mistake in result.hidden.errors]
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
@@ -48,7 +48,7 @@ def summary(
         "cells": result.calset.cells,
         "trusted": verdict.trusted,
         "quality": int(verdict.quality),
-        "doubts": list(verdict.doubts),
+        "doubts": list(verdict.residual_doubts),
         "warnings": list(verdict.warnings),
         "structure": dataclasses.asdict(verdict.structure),
         "hidden": mistakes,

@@ -295,7 +295,7 @@ def _apply_to_each(
     told = [outcome.text for outcome in ended if outcome.text] or [f"{output}: nothing was left to do"]
     reasons = [Doubt(Quality.CATALOGUE, f"{name}: {text}") for name, text in doubts.items()]
     subject = f"{len(doubted)} of {len(places)} tables" if doubted else str(output)
-    verdict = Verdict(against=tuple(reasons), subject=subject, stars="table by table, below")
+    verdict = Verdict(doubts=tuple(reasons), subject=subject, stars="table by table, below")
     document |= verdict.answers()
     text = "\n".join((verdict.display().text(), *told))
     about = list(dict.fromkeys(warnings))

@@ -106,7 +106,7 @@ def refit(
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
-    from walop_jax.fit.refit import with_honest_errors
+    from walop_jax.fit.refit import with_empirical_covariance
     from walop_jax.science.field_accuracy import accuracy_of_fit, verdict_of_fit
 
     wanted = goal_of(goal) or GOAL
@@ -117,7 +117,7 @@ def refit(
             fitted = fit(calset, chosen, progress=say)
         else:
             say(Stage("fitting without outliers", "fitting"))
-            fitted = with_honest_errors(clipped(calset, chosen, clip))
+            fitted = with_empirical_covariance(clipped(calset, chosen, clip))
         say(Stage("looking for patterns in the residuals", "examining"))
         result = examined(fitted, job.seed)
         accuracy = accuracy_of_fit(result, wanted)

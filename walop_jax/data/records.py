@@ -18,7 +18,7 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-RUN = 64  # field points that are sampled together
+SAMPLED_TOGETHER = 64  # field points that are sampled together
 SPOT = 8.0  # standard errors from which a patch of the field holds structure of its own
 ROUNDING = 1e-10  # mean square gain of the rounding of numbers without noise
 FINE = 4.0  # standard errors from which the whole field holds some
@@ -580,6 +580,6 @@ def sampled(intensities: Intensities, total: int, most: int) -> tuple[Int[np.nda
     """Field points of a set of so many, `most` at most and in evenly spaced runs, and their data."""
     if total <= most:
         return np.arange(total), intensities.block(0, total)
-    starts = np.linspace(0, total - RUN, most // RUN).astype(int)
-    blocks = [intensities.block(start, start + RUN) for start in starts.tolist()]
-    return (starts[:, None] + np.arange(RUN)).ravel(), Block.joined(blocks)
+    starts = np.linspace(0, total - SAMPLED_TOGETHER, most // SAMPLED_TOGETHER).astype(int)
+    blocks = [intensities.block(start, start + SAMPLED_TOGETHER) for start in starts.tolist()]
+    return (starts[:, None] + np.arange(SAMPLED_TOGETHER)).ravel(), Block.joined(blocks)

@@ -109,7 +109,9 @@ def shape_of(laid: Laid) -> Shape | None:
     _, at_any = laid.added([((1.0, change),) for change in steady])
     acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
     # Of other dependences than those described stars have none: each is a program's worth of derivatives.
-    on_stars = tuple(j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws)
+    on_stars = tuple(
+        j for j, c in enumerate(changes) if acting[j] and c.applies_to_catalogue and c.beside_field in laws
+    )
     spread = laid.error_of_p(between)
     return Shape(tuple(changes), moment, member.slopes, on_stars, spread, laid.stated)
 
@@ -338,7 +340,9 @@ def _no_starlight(probe: Probe, template: Instrument) -> bool:
     """True of a candidate that changes calibration exposures and not the light of stars."""
     changes = [c for member in probe.group for total in member.first_order(template) for _, c in total]
     laws = ({item.depends_on for item in change.grows_with} & {EXPOSURE, COUNTS} for change in changes)
-    return bool(changes) and all(law or not c.of_stars for law, c in zip(laws, changes, strict=True))
+    return bool(changes) and all(
+        law or not c.applies_to_catalogue for law, c in zip(laws, changes, strict=True)
+    )
 
 
 def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:

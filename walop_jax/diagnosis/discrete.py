@@ -213,7 +213,7 @@ class _Look:
         place, least = {item.what: n for n, item in enumerate(items)}, good[0].explained
         alike = [item for item in good if item.explained < thresholds.READING_ALIKE * least]
         # Within an odds ratio of e³ the data do not say which: the commoner one is listed first.
-        free = max(self.likelihood.census.n_data, 1)
+        free = max(self.likelihood.used_data.n_data, 1)
         equal = least + 2.0 * thresholds.EVEN_ODDS / free
         return tuple(
             sorted(

@@ -161,7 +161,7 @@ def _try_model(
         likelihood,
         start=np.array([start.get(p.name, p.start) for p in model.parameters]),
         noise_scale=base.noise_scale,
-        worth=base.expansion.objective,
+        target_objective=base.expansion.objective,
     )
     bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.expansion.matrix).all():

@@ -89,7 +89,7 @@ def gauges(model: Model, flux_known: bool) -> list[str]:
     cameras = model.template.cameras
     if flux_known and not cameras.split:
         return []
-    units = tuple(f"throughput.n{camera}." for camera in cameras.units)
+    units = tuple(f"throughput.n{camera}." for camera in cameras.ratio_references)
     return [name for name in model.names if name.startswith(units)] if units else [GAUGE]
 
 

@@ -169,7 +169,7 @@ class FitResult(Fitted):
             if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
         )
 
-    def judged(
+    def with_verdict(
         self,
         doubts: Sequence[str] = (),
         *,
@@ -189,21 +189,21 @@ class FitResult(Fitted):
             n_data=self.n_data,
             noise_scale=self.noise_scale,
             converged=self.converged,
-            against=tuple(_against(self, doubts, examined=True, noiseless=noiseless, remedies=remedies)),
+            doubts=tuple(_doubts(self, doubts, examined=True, noiseless=noiseless, remedies=remedies)),
             errors_from=self.errors_from,
             structure=structure,
         )
         return dataclasses.replace(self, verdict=verdict)
 
-    def remarked(self, sentence: str) -> FitResult:
+    def with_remark(self, sentence: str) -> FitResult:
         """The fit with a remark in its verdict, which forbids nothing."""
-        return self.doubted(Quality(0), sentence)
+        return self.with_doubt(Quality(0), sentence)
 
-    def doubted(self, bit: Quality, sentence: str) -> FitResult:
+    def with_doubt(self, bit: Quality, sentence: str) -> FitResult:
         """The fit with one more thing against it, which forbids trust unless it has no bit."""
         verdict = self.checked_verdict()
-        against = (*verdict.against, Doubt(bit, sentence, blocking=bool(bit)))
-        return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
+        against = (*verdict.doubts, Doubt(bit, sentence, blocking=bool(bit)))
+        return dataclasses.replace(self, verdict=dataclasses.replace(verdict, doubts=against))
 
     def checked_verdict(self) -> Verdict:
         """The verdict; raises RuntimeError for a fit without one."""
@@ -222,7 +222,7 @@ class FitResult(Fitted):
         """The sentences of the verdict; of a fit that was not examined, those on χ², priors and convergence."""
         if self.verdict is not None:
             return self.verdict.warnings
-        doubts = _against(self, (), examined=False, noiseless=False)
+        doubts = _doubts(self, (), examined=False, noiseless=False)
         return tuple(doubt.sentence for doubt in doubts if doubt.sentence)
 
     def residuals(self) -> Float[np.ndarray, "p e k"]:
@@ -283,15 +283,15 @@ def fit(
     *,
     start: Vector | None = None,
     noise_scale: float | None = None,
-    worth: float | None = None,
+    target_objective: float | None = None,
 ) -> FitResult:
     """Maximise a likelihood with its priors, from the start values of the model or `start` (a full vector).
 
     A model whose χ²/dof stays above `search.FAR_OFF` would be bent out of all physical shape: priors mean nothing
     beside such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from
     plates one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale`
-    that is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other
-    fit, and a search that has not come below it when it should have converged is given up.
+    that is given is kept, with no other start, so that fits can be compared. `target_objective` is the objective of the
+    fit with which this one is compared: a search that has not come below it when it should have converged is given up.
     The minimum of a large set (`Layout.large`) is sought on a sample of its points; a pass over all of them gives
     the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.
@@ -300,14 +300,14 @@ def fit(
     first = likelihood.model.start if start is None else np.asarray(start, float)
     # Where errors of the data have parameters, the instrument is sought first, with errors held.
     likelihood = likelihood.with_errors_at(first)
-    best = find_minimum(likelihood, first, noise_scale, worth)
+    best = find_minimum(likelihood, first, noise_scale, target_objective)
     for _ in range(LAYOUTS):
         # Retarders that a fit has made thicker need more wavelengths than those that it began with.
         before, likelihood = likelihood, likelihood.following(best.x)
         if likelihood is before:
             break
         likelihood = likelihood.with_errors_at(first)
-        best = find_minimum(likelihood, best.x, noise_scale, worth)
+        best = find_minimum(likelihood, best.x, noise_scale, target_objective)
     if likelihood.model.template.noise is not None:
         best = with_errors_fitted(likelihood, best, first, noise_scale or 1.0)
     return fit_at(likelihood, best, time.perf_counter() - began)
@@ -333,7 +333,7 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
     )
 
 
-def with_honest_errors(result: FitResult) -> FitResult:
+def with_empirical_covariance(result: FitResult) -> FitResult:
     """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
 
     Only the covariance changes; the verdict is to be made anew. For reported errors: model comparison keeps the stated
@@ -347,7 +347,7 @@ def with_honest_errors(result: FitResult) -> FitResult:
     return dataclasses.replace(result, covariance=errors, errors_from=made_from, verdict=None)
 
 
-def _against(
+def _doubts(
     result: FitResult,
     doubts: Sequence[str],
     *,
@@ -422,10 +422,10 @@ def refit(
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 
-    `progress` is called with a line about each step. Errors are those of `with_honest_errors`. Raises what `fit`
+    `progress` is called with a line about each step. Errors are those of `with_empirical_covariance`. Raises what `fit`
     raises.
     """
     runner = Runner(progress=progress)
     likelihood = Likelihood.of(calset, model or base_model(calset), runner=runner)
     runner.tell(Stage("preparing the fit", "fitting"))
-    return with_honest_errors(fit(likelihood))
+    return with_empirical_covariance(fit(likelihood))

@@ -17,7 +17,7 @@ from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, UsedData
 from walop_jax.model import materials
 from walop_jax.model.noise import NOISE
 from walop_jax.model.specification import Model, Vector
@@ -106,7 +106,7 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
     unit = free_scales(model)
     inverse = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), rcond=1e-15, hermitian=True)
     taken_up = float(np.sum(inverse * of_data * np.outer(unit, unit)))
-    data = float(expansion.census.rows @ likelihood.data_per_row)
+    data = float(expansion.used_data.rows @ likelihood.data_per_row)
     live = dataclasses.replace(likelihood.with_errors_at(None), left=1.0 - taken_up / max(data, 1.0))
     found = _search(
         live, "fit with errors of the data", model.full(start[model.free], start), noise_scale, expansion
@@ -115,20 +115,20 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
 
 
 def find_minimum(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
 ) -> Found:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    The sample of a very large set is large itself. `noise_scale` and `worth` are those of `refit.fit`. Raises
-    `DataError` when the exposures cannot determine the instrument.
+    The sample of a very large set is large itself. `noise_scale` and `target_objective` as for `refit.fit`.
+    Raises `DataError` when the exposures cannot determine the instrument.
     """
     layout = likelihood.layout
     if not layout.large:
-        return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, worth))
+        return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, target_objective))
     sample_set = thinned(likelihood.calset, max(limits.SAMPLE, layout.points // limits.FARTHEST))
     sample = Likelihood.of(sample_set, likelihood.model, runner=likelihood.runner)
     sample = sample.with_errors_at(likelihood.errors_at)
-    best = find_minimum(sample, first, noise_scale, worth)
+    best = find_minimum(sample, first, noise_scale, target_objective)
     scale = best.expansion.noise_scale
     found = _search(likelihood, "fit of all points", best.x, scale, tolerance=LARGE_TOLERANCE, damping=0.0)
     return dataclasses.replace(found, starts=best.starts)
@@ -161,14 +161,18 @@ def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
 
 
 def _from_afar(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
 ) -> Found:
     """The minimum from start values that may be far away, the errors of the data scaled if need be."""
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
-    promising = best.expansion.objective < worth if worth is not None else best.expansion.misfit < FAR_OFF
-    if not best.converged and promising:
+    improving = (
+        best.expansion.objective < target_objective
+        if target_objective is not None
+        else best.expansion.misfit < FAR_OFF
+    )
+    if not best.converged and improving:
         how = {"damping": 0.0, "secant": True}
         best = _search(likelihood, "fit, continued", best.x, scale, best.expansion, **how)
     if noise_scale is not None or best.expansion.misfit < FAR_OFF:
@@ -219,12 +223,12 @@ def _far_off(likelihood: Likelihood, best: Found) -> Found:
     return dataclasses.replace(best, starts=starts)
 
 
-def check_identifiable(likelihood: Likelihood, census: Census | None = None) -> None:
+def check_identifiable(likelihood: Likelihood, used_data: UsedData | None = None) -> None:
     """Raise `DataError` when the exposures cannot determine an instrument at all.
 
-    `census` is that of its points, where it is at hand: else they are counted.
+    `used_data` says which data of the set are used, if the caller has counted them already; else they are counted here.
     """
-    rows = (likelihood.census if census is None else census).rows
+    rows = (likelihood.used_data if used_data is None else used_data).rows
     e, inputs = likelihood.calset.exposures, ", ".join(str(entry.path) for entry in likelihood.calset.inputs)
     polariser = likelihood.model.template.polariser is not None
     through = (e.clp_in | (not polariser)) & (rows > 0)

@@ -153,7 +153,7 @@ EFFECT, DATA = "effect", "data"
 """Kinds of mistakes that could hide: of the model of the instrument, of numbers that the set states."""
 
 
-class Mistake(NamedTuple):
+class UndetectedError(NamedTuple):
     """A mistake that the data would not show.
 
     Its `size` in `unit` would just have been found, or is the largest plausible one. `kind` is `EFFECT` or `DATA`,
@@ -179,24 +179,24 @@ class Hidden:
     them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
     """
 
-    mistakes: tuple[Mistake, ...]
+    errors: tuple[UndetectedError, ...]
     changes: Float[np.ndarray, "s n"]
 
     def __len__(self) -> int:
-        return len(self.mistakes)
+        return len(self.errors)
 
     def not_measured(self) -> tuple[str, ...]:
         """Names of all unmeasured mistakes, each with the measurement to take."""
         together: dict[str, list[str]] = {}
-        for mistake in self.mistakes:
-            if not mistake.measured:
-                together.setdefault(mistake.remedy, []).append(mistake.name)
+        for error in self.errors:
+            if not error.measured:
+                together.setdefault(error.remedy, []).append(error.name)
         joined = {", ".join(names): remedy for remedy, names in together.items()}
         return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
         """The worst of them in a sentence."""
-        sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.mistakes]
+        sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.errors]
         return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
 
@@ -216,7 +216,7 @@ class VerdictPart(NamedTuple):
 class Verdict(Displayed):
     """The verdict on `subject`: all doubts about it, and statistics where it is a fit.
 
-    The one rule of trust: a result is trusted, and a go, if none of the doubts `against` it is blocking. `stars` says
+    The one rule of trust: a result is trusted, and a go, if none of its `doubts` is blocking. `stars` says
     how well p of a star is known with it. `parts` are the results that the doubts were read off, by name.
 
     Of a fit: `noise_scale` multiplied the errors of the data (1: as given); `structure` is what field points differ by;
@@ -229,7 +229,7 @@ class Verdict(Displayed):
     n_data: int = 0
     noise_scale: float = 1.0
     converged: bool = True
-    against: tuple[Doubt, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     covariance_from: str = "fit"
     errors_from: str = STATED
     structure: Structure = NO_STRUCTURE
@@ -247,7 +247,7 @@ class Verdict(Displayed):
         bits = Quality(quality)
         first = (Doubt(bits, said.pop(0) if said and not trusted else "", blocking=not trusted),)
         remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in said)
-        return cls(**others, against=(*(first if quality or not trusted else ()), *remarks))
+        return cls(**others, doubts=(*(first if quality or not trusted else ()), *remarks))
 
     def with_doubts(
         self,
@@ -258,13 +258,13 @@ class Verdict(Displayed):
         parts: Mapping[str, VerdictPart] | None = None,
     ) -> Verdict:
         """The verdict with more against it, each sentence once."""
-        against, said = [*self.against], {doubt.sentence for doubt in self.against}
+        kept, said = [*self.doubts], {doubt.sentence for doubt in self.doubts}
         for doubt in doubts:
             if doubt.sentence not in said or not doubt.sentence:
-                against.append(doubt)
+                kept.append(doubt)
             said.add(doubt.sentence)
         return dataclasses.replace(
-            self, against=tuple(against), subject=subject or self.subject, stars=stars or self.stars,
+            self, doubts=tuple(kept), subject=subject or self.subject, stars=stars or self.stars,
             parts={**self.parts, **(parts or {})},
         )  # fmt: skip
 
@@ -277,7 +277,7 @@ class Verdict(Displayed):
     @property
     def trusted(self) -> bool:
         """True if no doubt forbids the use."""
-        return not any(doubt.blocking for doubt in self.against)
+        return not any(doubt.blocking for doubt in self.doubts)
 
     @property
     def go(self) -> bool:
@@ -287,23 +287,23 @@ class Verdict(Displayed):
     @property
     def quality(self) -> Quality:
         """The bits of all doubts."""
-        return functools.reduce(operator.or_, (doubt.bit for doubt in self.against), Quality(0))
+        return functools.reduce(operator.or_, (doubt.bit for doubt in self.doubts), Quality(0))
 
     @property
     def reasons(self) -> tuple[Doubt, ...]:
         """All doubts that say something, the one that does most to q and u of stars first."""
-        told = [doubt for doubt in self.against if doubt.blocking or doubt.sentence]
+        told = [doubt for doubt in self.doubts if doubt.blocking or doubt.sentence]
         return tuple(sorted(told, key=lambda doubt: doubt._rank))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts and remarks in sentences."""
-        return tuple(doubt.sentence for doubt in self.against if doubt.sentence)
+        return tuple(doubt.sentence for doubt in self.doubts if doubt.sentence)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def residual_doubts(self) -> tuple[str, ...]:
         """The sentences about the residuals alone (`Quality.DOUBTED`)."""
-        return tuple(d.sentence for d in self.against if d.bit & Quality.DOUBTED and d.sentence)
+        return tuple(d.sentence for d in self.doubts if d.bit & Quality.DOUBTED and d.sentence)
 
     @property
     def objections(self) -> tuple[str, ...]:

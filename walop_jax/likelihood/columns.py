@@ -30,9 +30,9 @@ from walop_jax.likelihood.engine import (
     PointData,
     best_flux,
     counts_and_slope,
+    detected_counts,
+    flux_groups,
     point_prediction,
-    real_counts,
-    sharing,
 )
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.layout import median_over_field
@@ -50,7 +50,7 @@ from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
-from walop_jax.model.sources import ExposureArrays, Sight
+from walop_jax.model.sources import ExposureArrays, PointIllumination
 
 Change = Sequence[tuple[float, Sentence]]
 """A sum of sentences with their coefficients."""
@@ -95,14 +95,14 @@ def _own_at_point(
 
     def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
         active = put(amplitudes)
-        return real_counts(active, plan, point_prediction(active, plan, point), flux, point)
+        return detected_counts(active, plan, point_prediction(active, plan, point), flux, point)
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
     size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
     change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
     along = counts_and_slope(at_neutral, plan, unit, flux, point)[1] * point.weight
-    projected = project_flux(change, along, plan.exposures.flux_known, sharing(instrument, plan, point))
+    projected = project_flux(change, along, plan.exposures.flux_known, flux_groups(instrument, plan, point))
     return -projected.reshape(len(change), -1).T
 
 
@@ -133,17 +133,19 @@ class _AtPoint(NamedTuple):
 def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     assert point.opposite_sky is not None
     x, y = jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
-    sights = Sight(plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y)
+    illuminations = PointIllumination(
+        plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y
+    )
     sites = 2 if light.has_ghosts(instrument) else 1
     vectors = jax.vmap(slots.vector_slopes, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
-    lights = jax.vmap(slots.light_slopes, (None, Sight(None, 0, None, 0, 0)))(
-        instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
+    lights = jax.vmap(slots.light_slopes, (None, PointIllumination(None, 0, None, 0, 0)))(
+        instrument, illuminations._replace(sky=illuminations.sky[:sites], x=x[:sites], y=y[:sites])
     )
     counts = jnp.einsum("meks,meks->mek", vectors.vectors[:, point.band], lights.taken)
     if sites == 1:
         rows, throughput = light.band_rows(instrument, plan, x[1], y[1]), instrument.throughput.at(x[1], y[1])
-        sight = sights._replace(sky=point.opposite_sky, x=x[1], y=y[1])
-        opposite = light.counts(instrument, rows, throughput, sight, point.band)
+        illumination = illuminations._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+        opposite = light.counts(instrument, rows, throughput, illumination, point.band)
     else:
         opposite = counts[1]
     unit = light.with_ghosts(instrument, counts[0], opposite, point.source)
@@ -290,7 +292,7 @@ class Columns:
         if planned is not None:
             return np.asarray(planned)
         _, residual = self.likelihood.residuals(self.values)
-        residual = self.likelihood.sharing.independent(residual, inverse=True)
+        residual = self.likelihood.flux_groups.independent(residual, inverse=True)
         counts, weight = map(self.likelihood.points.gathered, ("counts", "weight"))
         used = self.likelihood.used[..., None]
         return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
@@ -369,7 +371,7 @@ class ResponseBlock:
         self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
-        self.shared = sharing(of.patched, of.plan, data)
+        self.shared = flux_groups(of.patched, of.plan, data)
         self.whole = not self.linear or not self.shared.single
         self.chosen = np.arange(self.used.size) if self.whole else np.flatnonzero(self.used)
         self.sites, self.cameras = self.found.share.shape[1], weight.shape[2]

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_positions, to_all
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
@@ -34,7 +34,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import Counts
 from walop_jax.model.parameters import Vector, values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
 
 Flux = Float[Array, "e f"]
@@ -53,20 +53,20 @@ class PointData(NamedTuple):
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
     opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
-    stars: Float[Array, "p e k c"] | None = None  # `Sharing.stars`, only where stars of a field scatter
+    stars: Float[Array, "p e k c"] | None = None  # `FluxGroups.stars`, only where stars of a field scatter
 
-    def sight(self, plan: Plan) -> Sight:
+    def illumination(self, plan: Plan) -> PointIllumination:
         """Quantities of a field point that the model asks for."""
-        return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
+        return PointIllumination(plan.exposures, self.sky, self.source, self.x, self.y)
 
 
-def sharing(instrument: Instrument, plan: Plan, point: PointData | None = None) -> Sharing:
+def flux_groups(instrument: Instrument, plan: Plan, point: PointData | None = None) -> FluxGroups:
     """Common fluxes of cameras and of the exposures of a plan; at a point, common q, u of its star."""
     stars = None if point is None else point.stars
-    return Sharing(instrument.cameras.together, plan.exposures.shared, stars)
+    return FluxGroups(instrument.cameras.together, plan.exposures.shared, stars)
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """χ², and with respect to all parameters its half gradient Jᵀr and Gauss–Newton matrix JᵀJ."""
 
     chi2: Float[Any, ""]
@@ -107,12 +107,12 @@ def unit_counts(
 ) -> Counts:
     """Counts for light of unit flux, ahead of the detectors."""
     x, y = field_sites(instrument, point)
-    sight = point.sight(plan)
-    counts = light.counts(instrument, rows[0], throughput[0], sight, point.band)
+    illumination = point.illumination(plan)
+    counts = light.counts(instrument, rows[0], throughput[0], illumination, point.band)
     if point.opposite_sky is None or len(x) == 1:
         return counts
-    sight = sight._replace(sky=point.opposite_sky, x=x[1], y=y[1])
-    opposite = light.counts(instrument, rows[1], throughput[1], sight, point.band)
+    illumination = illumination._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+    opposite = light.counts(instrument, rows[1], throughput[1], illumination, point.band)
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
@@ -130,7 +130,7 @@ def vectors_at(instrument: Instrument, plan: Plan, point: PointData, nodes: Node
 
 def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> Flux:
     """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
-    flux_known, shared = plan.exposures.flux_known, sharing(instrument, plan)
+    flux_known, shared = plan.exposures.flux_known, flux_groups(instrument, plan)
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
@@ -141,7 +141,7 @@ def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData
     return flux
 
 
-def real_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData) -> Counts:
+def detected_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData) -> Counts:
     """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit, point.x, point.y)
 
@@ -150,7 +150,9 @@ def counts_and_slope(
     instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData
 ) -> tuple[Counts, Counts]:
     """The same, and their derivative with respect to the flux."""
-    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f, point), (flux,), (jnp.ones_like(flux),))
+    return jax.jvp(
+        lambda f: detected_counts(instrument, plan, unit, f, point), (flux,), (jnp.ones_like(flux),)
+    )
 
 
 def point_residuals(
@@ -163,8 +165,8 @@ def point_residuals(
 def residuals_of(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> tuple[Flux, Counts]:
     """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
-    residual = (point.counts - real_counts(instrument, plan, unit, flux, point)) * point.weight
-    return flux, sharing(instrument, plan, point).independent(residual)
+    residual = (point.counts - detected_counts(instrument, plan, unit, flux, point)) * point.weight
+    return flux, flux_groups(instrument, plan, point).independent(residual)
 
 
 def _linear_unit_counts(
@@ -229,19 +231,21 @@ def _point_jacobian(
         all_values = jnp.concatenate([unit_steps, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
-    shared = sharing(instrument, plan, point)
+    shared = flux_groups(instrument, plan, point)
     projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known, shared)
     residual = shared.independent((point.counts - counts) * point.weight)
     return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
-def normal_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None) -> Normal:
+def normal_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None
+) -> NormalEquations:
     """χ² and its expansion from some points: with optics on nodes block by block, else from the rows of all points.
 
     Rows come from a program that errors and verdict need anyway, `limits.BATCH` points at a time.
     """
     if nodes is not None:
-        return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
+        return NormalEquations(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
         rows = slice(start, start + limits.BATCH)
@@ -250,10 +254,10 @@ def normal_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
         residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
-    return Normal(chi2, gradient, matrix)
+    return NormalEquations(chi2, gradient, matrix)
 
 
-def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
+def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> NormalEquations:
     """Sums over blocks of points, whose intermediate results stay in the processor's cache; few are one block."""
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
@@ -273,7 +277,9 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     return jax.lax.scan(add, nothing, parts)[0]
 
 
-def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
+def _block_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable
+) -> NormalEquations:
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
     def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
@@ -297,7 +303,7 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
     matrix = matrix.at[np.ix_(plain, plain)].set(gram[:, :k, :k].sum(axis=0))
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
     matrix = matrix.at[np.ix_(series, series)].set(square)
-    return Normal(chi2.sum(), g, matrix)
+    return NormalEquations(chi2.sum(), g, matrix)
 
 
 def _residuals(
@@ -318,7 +324,7 @@ def residuals_and_slopes(
 
 
 def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
-    return light.stokes(instrument, point.sight(plan))
+    return light.stokes(instrument, point.illumination(plan))
 
 
 incoming = compiled(jax.vmap(_incoming, (None, None, 0)), kept_as="incoming")

@@ -8,7 +8,7 @@ Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse
             δ ~ N(0, 1) in a direction adds A Aᵀ to the covariance of its r, A = ∂r/∂δ, and r ← (1 + A Aᵀ)^(−1/2) r
             as well as d makes them independent again (`inverses.of_low_rank`)
 Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
-            (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`Sharing`)
+            (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`FluxGroups`)
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def namespace(*arrays: Any) -> ModuleType:
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
-class Sharing(NamedTuple):
+class FluxGroups(NamedTuple):
     """Common fluxes: `cameras` is 1 where two of them share one, `exposures` where one is of a group that does.
 
     None: all cameras; every exposure for itself. `stars` is U of 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2) at a point, where the
@@ -66,7 +66,7 @@ class Sharing(NamedTuple):
         return (flat - (flat @ xp.swapaxes(back, -2, -1)) @ xp.swapaxes(stars, -2, -1)).reshape(values.shape)
 
 
-ALONE = Sharing()
+ALONE = FluxGroups()
 """A flux for every exposure, of all cameras."""
 
 
@@ -74,9 +74,9 @@ def eliminate_flux(
     weighted_counts: Float[Any, "... k"],
     weighted_model: Float[Any, "... k"],
     flux_known: Bool[Any, ...],
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
 ) -> tuple[Float[Any, "... f"], Float[Any, "... k"]]:
-    """Best flux of every exposure and the normalised residuals data − model; f as in `Sharing.summed`."""
+    """Best flux of every exposure and the normalised residuals data − model; f as in `FluxGroups.summed`."""
     xp = namespace(weighted_model)
     power = shared.summed(weighted_model**2)
     best = shared.summed(weighted_counts * weighted_model) / xp.where(power > 0, power, 1.0)
@@ -88,7 +88,7 @@ def project_flux(
     columns: Float[Any, "... k"],
     along: Float[Any, "... k"],
     flux_known: Bool[Any, ...] | bool = False,
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
 ) -> Float[Any, "... k"]:
     """Derivatives of weighted counts, `columns`, without the component along a change of the flux.
 

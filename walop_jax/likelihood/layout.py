@@ -23,7 +23,7 @@ from walop_jax.data.records import (
     Sources,
 )
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.engine import PointData, sharing, star_responses
+from walop_jax.likelihood.engine import PointData, flux_groups, star_responses
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import of_low_rank
 from walop_jax.likelihood.noise import NoiseTerms, variance_ratio
@@ -144,7 +144,7 @@ def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
     return Rectangle(low - thin, high + thin)
 
 
-class RunsOfPoints(Intensities):
+class BlocksOfPoints(Intensities):
     """Runs of `length` neighbouring points of a set, beginning at the points `starts`."""
 
     def __init__(self, whole: Intensities, starts: Int[np.ndarray, " s"], length: int) -> None:
@@ -184,7 +184,7 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     starts = _spread(n, most, length)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
-    runs = RunsOfPoints(calset.intensities, starts, length)
+    runs = BlocksOfPoints(calset.intensities, starts, length)
     return dataclasses.replace(calset, points=points, intensities=runs)
 
 
@@ -276,10 +276,12 @@ class PointReader:
         return NoiseTerms.of(noise, self.calset.exposures.kind.tolist(), self.instrument.cameras.names)
 
     def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
-        """`Sharing.stars`: q, u of a star differ from those of its field by the same in all exposures of its point."""
+        """`FluxGroups.stars` of some points: in all exposures of its point a star differs from its field by the same q,
+        u.
+        """
         share = np.asarray(star_responses(self.instrument, self.plan, array(fields), data))
         counts = np.asarray(data.counts) * np.asarray(data.weight)
-        shared = sharing(self.instrument, self.plan)
+        shared = flux_groups(self.instrument, self.plan)
         change = np.moveaxis(share * counts[..., None], -1, 0)
         change = project_flux(change, counts, np.asarray(self.plan.exposures.flux_known), shared)
         return of_low_rank(np.moveaxis(change, 0, -1))

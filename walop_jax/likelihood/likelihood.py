@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.data.records import CalibrationSet
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
-from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.flux import FluxGroups
 from walop_jax.likelihood.inverses import determined
 from walop_jax.likelihood.layout import (
     Layout,
@@ -39,8 +39,13 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 
-class Census(NamedTuple):
-    """Number of points used in each exposure; smallest and largest x, then y (deg), of those used in any; cameras."""
+class UsedData(NamedTuple):
+    """How much of a set is used, and where in the field: what degrees of freedom and maps are counted from.
+
+    `rows` is the number of field points used in each exposure; `field` the smallest and largest x, then the smallest
+    and largest y (deg), of the points that are used in any exposure; `cameras` the number of cameras. Ten points in
+    two exposures of four cameras are rows (10, 10), that is 80 intensities.
+    """
 
     rows: Int[np.ndarray, " e"]
     field: tuple[float, float, float, float]
@@ -51,14 +56,14 @@ class Census(NamedTuple):
         """Number of intensities used."""
         return self.cameras * int(self.rows.sum())
 
-    def joined(self, other: Census) -> Census:
-        """Census of two parts of a set."""
+    def joined(self, other: UsedData) -> UsedData:
+        """The counts of two parts of a set, added, and the rectangle around both fields."""
         (a, b, c, d), (e, f, g, h) = self.field, other.field
-        return Census(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
+        return UsedData(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
 
 
 class DataTerms(NamedTuple):
-    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census.
+    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; and which data were used.
 
     Where errors of the data have parameters, `log_variance` is the rest of −2 ln L (`noise.log_variance`), and gradient
     and matrix hold its part.
@@ -67,17 +72,19 @@ class DataTerms(NamedTuple):
     data: float
     gradient: Vector
     matrix: Matrix
-    census: Census
+    used_data: UsedData
     log_variance: float = 0.0
 
     def joined(self, other: DataTerms) -> DataTerms:
         """The terms of two parts of a set."""
-        a, b, census = self, other, self.census.joined(other.census)
+        a, b, used_data = self, other, self.used_data.joined(other.used_data)
         log_variance = a.log_variance + b.log_variance
-        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census, log_variance)
+        return DataTerms(
+            a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, used_data, log_variance
+        )
 
 
-Joined = TypeVar("Joined", Census, DataTerms)
+Joined = TypeVar("Joined", UsedData, DataTerms)
 
 
 class OpticsUsed(NamedTuple):
@@ -105,7 +112,7 @@ class Expansion:
     noise_scale: float
     gradient: Vector
     matrix: Matrix
-    census: Census
+    used_data: UsedData
     dof: int
     optics: OpticsUsed
     log_variance: float = 0.0
@@ -128,7 +135,7 @@ class Expansion:
     @property
     def n_data(self) -> int:
         """Number of intensities used."""
-        return self.census.n_data
+        return self.used_data.n_data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,10 +282,10 @@ class Likelihood:
         return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
 
     @cached_property
-    def sharing(self) -> Sharing:
+    def flux_groups(self) -> FluxGroups:
         """Fluxes in common to cameras and exposures, and q, u in common to the exposures of a star, point by point."""
         stars = self.points.gathered("stars") if len(fields_of_stars(self.calset.sources)) else None
-        return engine.sharing(self.model.template, self.plan)._replace(stars=stars)
+        return engine.flux_groups(self.model.template, self.plan)._replace(stars=stars)
 
     @cached_property
     def priors(self) -> PriorRows:
@@ -343,7 +350,7 @@ class Likelihood:
         data = stated._replace(weight=array(weight / np.sqrt(ratio)))
         chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
         residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
-        shared = engine.sharing(instrument, self.plan)
+        shared = engine.flux_groups(instrument, self.plan)
         of_errors = noise_expansion(
             noise, groups, counts, weight, residual, self.flux_known, shared, self.left
         )
@@ -370,20 +377,20 @@ class Likelihood:
             noise_scale=noise_scale,
             gradient=select.T @ gradient,
             matrix=matrix,
-            census=terms.census,
-            dof=self._independent(terms.census) - round(taken_up),
+            used_data=terms.used_data,
+            dof=self._independent(terms.used_data) - round(taken_up),
             optics=optics,
             log_variance=terms.log_variance,
         )
 
-    def _independent(self, census: Census) -> int:
+    def _independent(self, used_data: UsedData) -> int:
         of_errors = np.isin(self.priors.index, self.model.positions(NOISE))
-        return round(float(census.rows @ self.data_per_row)) + int((self.priors.known & ~of_errors).sum())
+        return round(float(used_data.rows @ self.data_per_row)) + int((self.priors.known & ~of_errors).sum())
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
     def _joined(self, label: str, function: Callable[[engine.PointData], Joined]) -> Joined:
-        """Results of a function for each batch of points, joined."""
+        """The results of `function` for all batches of points, joined into one by their method `joined`."""
 
         def work(number: int) -> Joined:
             return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.part(number)))
@@ -391,23 +398,26 @@ class Likelihood:
         parts = self.runner.each(label, work, self.layout.points, self.layout.part)
         return functools.reduce(lambda a, b: a.joined(b), parts)
 
-    def counted(self, data: engine.PointData) -> Census:
-        """The census of some points."""
+    def counted(self, data: engine.PointData) -> UsedData:
+        """Number and field of the data of some points that are used."""
         used = np.asarray(data.weight)[..., 0] > 0
         x, y = (np.asarray(at)[used.any(axis=1)] for at in (data.x, data.y))
         low, high = np.inf, -np.inf
         field = (x.min(initial=low), x.max(initial=high), y.min(initial=low), y.max(initial=high))
-        return Census(used.sum(axis=0), tuple(map(float, field)), self.cameras)  # pyright: ignore[reportArgumentType]
+        return UsedData(used.sum(axis=0), tuple(map(float, field)), self.cameras)  # pyright: ignore[reportArgumentType]
 
     @cached_property
-    def census(self) -> Census:
-        """Census of the used rows of the set, by a separate pass; an expansion brings its own census with it."""
+    def used_data(self) -> UsedData:
+        """Number and field of the used data of the whole set, counted by a pass of its own.
+
+        An expansion has counted them on its way (`Expansion.used_data`).
+        """
         return self._joined("counting", self.counted)
 
     @property
     def independent(self) -> int:
         """Number of independent data: those of every used row (`data_per_row`), and one per prior."""
-        return self._independent(self.census)
+        return self._independent(self.used_data)
 
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
@@ -444,7 +454,7 @@ class Likelihood:
         ratio = variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
         residual = self.with_errors_at(values).residuals(values)[1]
         light = np.where(weight > 0, counts * weight / np.sqrt(ratio) - residual, 0.0)
-        shared = engine.sharing(self.model.template, self.plan)
+        shared = engine.flux_groups(self.model.template, self.plan)
         return log_variance(ratio, light, self.flux_known, shared)
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:

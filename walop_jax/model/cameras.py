@@ -135,7 +135,7 @@ class Cameras(Component):
         return len(self.arms) if self.split else 1
 
     @property
-    def units(self) -> tuple[int, ...]:
+    def ratio_references(self) -> tuple[int, ...]:
         """Reference cameras where only ratios can be measured: of `split` arms, of a single pair."""
         alone = len(self.arms) == 1 and len(self.names) == 2
         return tuple(arm[0] for arm in self.arms) if self.split or alone else ()

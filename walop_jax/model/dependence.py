@@ -32,7 +32,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import by_shapes, parameter_places
 from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import SMOOTH, NotPlannedError, Ray
-from walop_jax.model.sources import ExposureArrays, Sight
+from walop_jax.model.sources import ExposureArrays, PointIllumination
 
 AT = 0.11, 0.07
 """A field point off the axis and at an odd place: no dependence may vanish by symmetry."""
@@ -57,8 +57,8 @@ def needs(instrument: Instrument) -> Needs:
         x, y = map(jnp.asarray, AT)
         rows = light.band_rows(patched, plan, x, y)
         zeros = jnp.zeros_like(plan.exposures.kind)
-        sight = Sight(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
-        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
+        illumination = PointIllumination(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
+        counts = light.counts(patched, rows, patched.throughput.at(x, y), illumination, zeros)
         return patched, light.detected(patched, plan.exposures, counts, x, y)
 
     (patched, _), quantities = _asking(run, instrument)

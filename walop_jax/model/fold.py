@@ -54,7 +54,7 @@ class Turning(NamedTuple):
 
 
 Angle = float | Turning
-State = tuple[Angle | None, ...]
+ElementPositions = tuple[Angle | None, ...]
 Solved = dict[tuple[int, Angle | None], Mueller | None]
 """Mueller matrices by number of the station and angle of its element (None: not moving)."""
 
@@ -68,7 +68,9 @@ def stations(elements: Sequence[Element], ray: Ray) -> tuple[list[Station], Ray]
     return result, ray
 
 
-def positions(element: Element, moving: Sequence[str], states: Sequence[State]) -> list[Angle | None]:
+def positions(
+    element: Element, moving: Sequence[str], states: Sequence[ElementPositions]
+) -> list[Angle | None]:
     """Angles (deg) of an element, state by state; None where it is out, or not moving (see `Solved`)."""
     if element.moves is None:
         return [None] * len(states)
@@ -86,7 +88,7 @@ class Fold(NamedTuple):
     arms: list[list[Station]]
     analysers: list[Analyser]
     moving: Sequence[str]
-    states: Sequence[State]
+    states: Sequence[ElementPositions]
 
     @classmethod
     def of(
@@ -95,7 +97,7 @@ class Fold(NamedTuple):
         arms: Sequence[Arm],
         ray: Ray,
         moving: Sequence[str],
-        states: Sequence[State],
+        states: Sequence[ElementPositions],
     ) -> Fold:
         """Elements ahead of the arms, and the arms behind them, for an entering ray."""
         first, ray = stations(common, ray)
@@ -201,7 +203,11 @@ class Fold(NamedTuple):
         return [common_places, *(arm for _, arm in arm_places)]
 
     def stacked(
-        self, matrices: Solved, number: int, states: Sequence[State] | None = None, out: Mueller | None = None
+        self,
+        matrices: Solved,
+        number: int,
+        states: Sequence[ElementPositions] | None = None,
+        out: Mueller | None = None,
     ) -> Mueller | None:
         """Matrices of a station in states (all), `out` (the identity) where it is out; None: always the identity."""
         element = self.stations[number][0]
@@ -221,7 +227,7 @@ class Fold(NamedTuple):
         return stack if len(shape) == 3 else stack[:, None]
 
     def _multiplied(
-        self, rows: Float[Array, "c n r 4"], matrices: Solved, number: int, keys: Sequence[State]
+        self, rows: Float[Array, "c n r 4"], matrices: Solved, number: int, keys: Sequence[ElementPositions]
     ) -> Float[Array, "c n r 4"]:
         """Rows of the light ahead of a station; unchanged in states without it."""
         element = self.common[number][0]
@@ -238,7 +244,7 @@ class Fold(NamedTuple):
         return rows.at[np.array(inside)].set(rows[np.array(inside)] @ matrix)
 
 
-def _restricted(state: State, columns: set[int]) -> State:
+def _restricted(state: ElementPositions, columns: set[int]) -> ElementPositions:
     return tuple(position if i in columns else None for i, position in enumerate(state))
 
 

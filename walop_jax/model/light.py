@@ -31,7 +31,7 @@ from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.light_path import LightPath, Scalar, is_achromatic
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import Ray
-from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
+from walop_jax.model.sources import ExposureArrays, PointIllumination, Source, turned
 
 Rows = Float[Array, "b r 4"]  # band, row of an analyser, Stokes
 Vectors = Float[Array, "b k 4"]  # band, camera, Stokes
@@ -224,80 +224,98 @@ def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, 
 # ----------------------------------------------------------------------------------------- light and counts
 
 
-def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
+def stokes(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
     """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
 
     Light through the polariser keeps no memory of its source; only light from the sky passes the telescope.
     """
     instrument = instrument.patched()
-    exposures, x, y = sight.exposures, sight.x, sight.y
-    sight = _turned(instrument, sight)
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
+    illumination = _turned(instrument, illumination)
     assigned = jnp.zeros(exposures.kind.shape, bool)
     qu = jnp.zeros((*assigned.shape, 2))
     for source in instrument.sources:
         if type(source).polarisation is not Source.polarisation:
-            shining = source.shines(sight) & ~assigned
-            qu, assigned = jnp.where(shining[:, None], source.polarisation(sight), qu), assigned | shining
-    light = _at_polariser(instrument, sight, jnp.ones_like(exposures.clp_angle), qu)
+            shining = source.shines(illumination) & ~assigned
+            qu, assigned = (
+                jnp.where(shining[:, None], source.polarisation(illumination), qu),
+                assigned | shining,
+            )
+    light = _at_polariser(instrument, illumination, jnp.ones_like(exposures.clp_angle), qu)
     polariser = instrument.polariser
     if polariser is None:
         return light
     return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
 
 
-def stokes_slopes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
+def stokes_slopes(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
     """Change of the Stokes vectors with wavelength (per µm) inside a band, for the colours of standards."""
     instrument = instrument.patched()
-    exposures, sight = sight.exposures, _turned(instrument, sight)
+    exposures, illumination = illumination.exposures, _turned(instrument, illumination)
     dark = jnp.zeros_like(exposures.clp_angle)
-    light = _at_polariser(instrument, sight, dark, instrument.standard.slope(sight))
+    light = _at_polariser(instrument, illumination, dark, instrument.standard.slope(illumination))
     return jnp.where(exposures.clp_in[:, None], 0.0, light)
 
 
 def _at_polariser(
-    instrument: LightPath, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
+    instrument: LightPath,
+    illumination: PointIllumination,
+    intensity: Float[Array, " e"],
+    qu: Float[Array, "e 2"],
 ) -> Float[Array, "e 4"]:
     """Light of an intensity and polarisation behind the telescope and the films of light from the sky."""
-    exposures, x, y = sight.exposures, sight.x, sight.y
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
     light = jnp.stack([intensity, qu[:, 0], qu[:, 1], jnp.zeros_like(intensity)], axis=-1)
     if instrument.telescope():
-        light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
+        light = jnp.where(
+            bypasses_telescope(instrument, illumination)[:, None],
+            light,
+            light @ telescope(instrument, x, y).T,
+        )
     for film in instrument.sky_films:
-        light = jnp.where(indoors(instrument, sight)[:, None], light, film.through(light, exposures, x, y))
+        light = jnp.where(
+            bypasses_telescope(instrument, illumination)[:, None], light, film.through(light, exposures, x, y)
+        )
     return light
 
 
-def indoors(instrument: LightPath, sight: Sight) -> Bool[Array, " e"]:
+def bypasses_telescope(instrument: LightPath, illumination: PointIllumination) -> Bool[Array, " e"]:
     """True for light that enters behind the telescope."""
-    sources = (source.shines(sight) for source in instrument.sources if not source.facts.from_sky)
-    return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
+    sources = (source.shines(illumination) for source in instrument.sources if not source.facts.from_sky)
+    return functools.reduce(jnp.logical_or, sources, jnp.zeros(illumination.source.shape, bool))
 
 
-def _turned(instrument: LightPath, sight: Sight) -> Sight:
-    """Sight with the true position angle of the instrument."""
+def _turned(instrument: LightPath, illumination: PointIllumination) -> PointIllumination:
+    """PointIllumination with the true position angle of the instrument."""
     if instrument.rotator_zero is None:
-        return sight
+        return illumination
     offset = jnp.deg2rad(instrument.rotator_zero)
-    exposures = eqx.tree_at(lambda e: e.rotator, sight.exposures, sight.exposures.rotator + offset)
-    sky = turned(sight.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
-    return sight._replace(exposures=exposures, sky=sky)
+    exposures = eqx.tree_at(
+        lambda e: e.rotator, illumination.exposures, illumination.exposures.rotator + offset
+    )
+    sky = turned(illumination.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
+    return illumination._replace(exposures=exposures, sky=sky)
 
 
 def counts(
-    instrument: LightPath, rows: Rows, throughput: Shares, sight: Sight, band: Int[Array, " e"]
+    instrument: LightPath,
+    rows: Rows,
+    throughput: Shares,
+    illumination: PointIllumination,
+    band: Int[Array, " e"],
 ) -> Counts:
     """Counts of the cameras in every exposure at a field point, for light of unit flux and no ghosts."""
     instrument = instrument.patched()
-    exposures, x, y = sight.exposures, sight.x, sight.y
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
     vectors = camera_vectors(instrument, rows, throughput, x, y)
-    light = stokes(instrument, sight)
+    light = stokes(instrument, illumination)
     if len(vectors) <= FEW_BANDS:  # a matrix product: indexing would copy the vectors for every exposure
         in_band = jax.nn.one_hot(band, len(vectors), dtype=light.dtype)
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
     if exposures.slope_band is not None:
-        slopes = stokes_slopes(instrument, sight)
+        slopes = stokes_slopes(instrument, illumination)
         result = result + jnp.einsum("eks,es->ek", vectors[exposures.slope_band], slopes)
     for gain in instrument.cameras.exposures:
         result = result * gain.factors(exposures, x, y)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import array
-from walop_jax.model.fold import State
+from walop_jax.model.fold import ElementPositions
 from walop_jax.model.light_path import LightPath
 from walop_jax.model.ray import SMOOTH, Conditions
 from walop_jax.model.sources import ExposureArrays
@@ -39,13 +39,13 @@ class Plan(eqx.Module):
     teff: Float[Array, " b"]
     exposures: ExposureArrays
     band_of: Int[np.ndarray, "e s"] = eqx.field(static=False)
-    settings: tuple[tuple[State, int, int], ...] = eqx.field(static=True)
+    settings: tuple[tuple[ElementPositions, int, int], ...] = eqx.field(static=True)
     moving: tuple[str, ...] = eqx.field(static=True)
     work: int = 0
     slope: Float[Array, " b"] | None = None
 
     @property
-    def states(self) -> list[State]:
+    def states(self) -> list[ElementPositions]:
         """Positions of the moving elements, setting by setting."""
         return [state for state, _, _ in self.settings]
 

@@ -1,8 +1,8 @@
 """Slots: places of possible changes of the light path, and the derivatives of the light in these changes.
 
 A slot is a change without factors (`effects.change`), or a term of one; the kind of a change holds its slots
-(`Kind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots. Elements,
-fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
+(`ChangeKind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots.
+Elements, fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
 
     inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
     number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
@@ -43,7 +43,7 @@ from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import by_shapes
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
-from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
+from walop_jax.model.sources import MoonPatches, MoonSky, PointIllumination, Standards
 
 Slot = tuple[Any, ...]
 Moved = Callable[[Float[Array, " t"]], Instrument]
@@ -331,14 +331,14 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     return {("light", *slot): i for i, slot in enumerate(slots)}
 
 
-def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
+def light_slopes(instrument: Instrument, illumination: PointIllumination) -> LightSlopes:
     """Slopes of the light at a field point."""
     instrument = instrument.patched()
-    exposures, x, y, slots = sight.exposures, sight.x, sight.y, light_slots(instrument)
+    exposures, x, y, slots = illumination.exposures, illumination.x, illumination.y, light_slots(instrument)
     count = exposures.kind.shape[0]
 
     def stokes(sizes: Float[Array, " l"]) -> Float[Array, "e 4"]:
-        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), sight)
+        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), illumination)
 
     value, push = jax.linearize(stokes, jnp.zeros(len(slots)))
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))

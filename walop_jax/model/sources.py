@@ -85,7 +85,7 @@ class ExposureArrays(eqx.Module):
         return self.kind == (self.kinds.index(name) if name in self.kinds else -1)
 
 
-class Sight(NamedTuple):
+class PointIllumination(NamedTuple):
     """Target at one field point, exposure by exposure.
 
     `sky` is (q, u) in the instrument frame of singly scattered moonlight for δ = 1, `source` the row of the
@@ -111,13 +111,13 @@ class Source(Component):
     facts: ClassVar[ExposureKind] = ExposureKind()
     reference: ClassVar[str] = ""
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
         """True for its exposures."""
-        return jnp.asarray(sight.exposures.of_kind(self.kind))
+        return jnp.asarray(illumination.exposures.of_kind(self.kind))
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
         """(q, u) in the instrument frame; unpolarised by default."""
-        return jnp.zeros((sight.exposures.kind.shape[0], 2))
+        return jnp.zeros((illumination.exposures.kind.shape[0], 2))
 
 
 def turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "e 2"]:
@@ -152,13 +152,13 @@ class MoonSky(Source):
     kind: ClassVar[str] = "moon"
     reference: ClassVar[str] = f"{PAPER_II}, eq. 8"
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
         """Moon exposures without the polariser."""
-        return super().shines(sight) & ~sight.exposures.clp_in
+        return super().shines(illumination) & ~illumination.exposures.clp_in
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
         """Polarisation of the patch."""
-        sky = sight.sky
+        sky = illumination.sky
         qu = self.depolarisation * sky
         if self.missing is not None:
             power = jnp.sum(sky**2, axis=-1, keepdims=True)
@@ -236,9 +236,9 @@ class Standards(Source):
         names = [self.names[i] for i in self.unknown] if field == "wavelength" else self.names
         return tuple(f"{name}.{field}" for name in names)
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
         """True for exposures with a star as their source."""
-        has_star = sight.source >= 0
+        has_star = illumination.source >= 0
         return has_star if self.names else jnp.zeros_like(has_star)
 
     def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
@@ -252,24 +252,24 @@ class Standards(Source):
         )
         return jnp.where(source >= 0, nearest, -1)
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
         """Polarisation of the star of each exposure, the mean over the band."""
         if not self.names:
-            return super().polarisation(sight)
-        return self._seen(sight)[0]
+            return super().polarisation(illumination)
+        return self._seen(illumination)[0]
 
-    def slope(self, sight: Sight) -> Float[Array, "e 2"]:
+    def slope(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
         """Change of (q, u) with wavelength (per µm) at the mean wavelength of the band; 0 without a star."""
-        return jnp.where(sight.source[:, None] >= 0, self._seen(sight)[1], 0.0)
+        return jnp.where(illumination.source[:, None] >= 0, self._seen(illumination)[1], 0.0)
 
-    def _seen(self, sight: Sight) -> tuple[Float[Array, "e 2"], Float[Array, "e 2"]]:
+    def _seen(self, illumination: PointIllumination) -> tuple[Float[Array, "e 2"], Float[Array, "e 2"]]:
         """(q, u) in the instrument frame, and its slope."""
-        colour = sight.exposures.colour
-        row = jnp.maximum(self.values(sight.source, colour), 0)
-        qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
+        colour = illumination.exposures.colour
+        row = jnp.maximum(self.values(illumination.source, colour), 0)
+        qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), illumination.exposures.rotator
         for change in self.changes:
             qu = qu.at[:, change.axis].add(
-                jnp.where(row == change.value, change.size * change.factor(sight.exposures), 0.0)
+                jnp.where(row == change.value, change.size * change.factor(illumination.exposures), 0.0)
             )
         if self.share is not None:
             qu = (1.0 + self.share) * qu

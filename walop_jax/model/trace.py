@@ -22,7 +22,7 @@ from walop_jax.model import fold, light
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.ray import Ray
-from walop_jax.model.sources import Sight, Standards
+from walop_jax.model.sources import PointIllumination, Standards
 
 STOKES = ("I", "Q", "U", "V")
 
@@ -82,7 +82,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     )
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     source = jnp.asarray([len(instrument.standard.names) - 1])
-    beam = light.stokes(instrument, Sight(exposure, jnp.zeros((1, 2)), source, x, y))[0]
+    beam = light.stokes(instrument, PointIllumination(exposure, jnp.zeros((1, 2)), source, x, y))[0]
     stages = [_one("source", "polariser" if through else "sky", beam)]
 
     # One Stokes vector per node, and its average over the band.

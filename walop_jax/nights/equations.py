@@ -196,13 +196,13 @@ def night_equations(
             terms, _ = likelihood.data_terms(point)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            beyond, census = {}, terms.census
+            beyond, used_data = {}, terms.used_data
         else:
             beyond = (
                 candidates_of(model, subset.exposures, known_effects(model)) if changes is None else changes
             )
             chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
-            census = likelihood.census
+            used_data = likelihood.used_data
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             what = "the model has no finite counts or derivatives where the nights meet"
             advice = (
@@ -222,8 +222,8 @@ def night_equations(
                 filters=tuple(np.unique(e.filter).tolist()),
                 source=source,
                 sha256=data_hash(calset),
-                n_data=census.n_data,
-                dof=round(float(census.rows @ likelihood.data_per_row)),
+                n_data=used_data.n_data,
+                dof=round(float(used_data.rows @ likelihood.data_per_row)),
                 chi2=chi2,
                 parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in beyond.values())),
                 candidates=len(beyond),

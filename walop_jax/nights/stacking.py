@@ -257,4 +257,4 @@ def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Para
         return True
     template = like.model.template
     changes = kind.neutral(effect_context(template, like.exposures)).first_order(template)
-    return all(change.of_stars for orders in changes for _, change in orders)
+    return all(change.applies_to_catalogue for orders in changes for _, change in orders)

@@ -25,7 +25,7 @@ from walop_jax.calibration.accuracy import (
     NODES,
     SIZE,
     TOLERANCE,
-    judged,
+    field_measured,
     measures_u,
     p_errors,
     reached,
@@ -122,7 +122,7 @@ class Survey(Drawn):
         stars = ""
         if self._matrix is not None:
             error = per_cent(self.error_of_p(self.last))
-            stars = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
+            stars = f"{error} % or better in {field_measured(self._matrix[3])}, on the last night"
         return Verdict(
             chi2, dof, n_data, 1.0, True, tuple(against), structure=structure,
             subject=f"Survey of {nights[0].instrument}", stars=stars,
@@ -243,14 +243,14 @@ class Survey(Drawn):
 
         Raises `DataError` outside `span` unless `force` is given, and where there is no calibration to begin with.
         """
-        (start, stop), against = self.span, self.verdict.against
+        (start, stop), against = self.span, self.verdict.doubts
         if not start <= mjd < stop:
             what = f"MJD {mjd:.3f} is outside the validity of the survey, {start:.3f} to {stop:.3f}"
             if not force:
                 advice = "calibrate a night nearer to it, or give --force (force=True in Python)"
                 raise fail(what, advice=advice)
             against = (*against, Doubt(Quality.VALIDITY_FORCED, what, blocking=False))
-        verdict = dataclasses.replace(self.verdict, against=against)
+        verdict = dataclasses.replace(self.verdict, doubts=against)
         return dataclasses.replace(self._product(mjd), verdict=verdict)
 
     def _product(self, mjd: float) -> Calibration:

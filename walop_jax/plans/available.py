@@ -188,8 +188,8 @@ class Available:
                 for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
                     angle = 0.0 if kind == "clp" else None
                     blank = Stop(angle, name, stops[0], moving, kind=kind, seconds=seconds)
-                    indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
-                    members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
+                    no_sky = kind == "clp" or (kind == "lamp" and plan.lamps)
+                    members = (blank,) if no_sky else tuple(self._members(blank, up.get(kind, ())))
                     if members:
                         one = CandidateExposure(kind, name, where, seconds, members)
                         candidates.append(one.over(one.turn))

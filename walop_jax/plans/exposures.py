@@ -26,7 +26,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.flux import FluxGroups, project_flux
 from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.likelihood.noise import NoiseTerms, factors
@@ -124,7 +124,7 @@ def candidates(
     likelihood = Likelihood.of(calset, model)
     flux, exptime = simulation.fluxes(plan, None), plan.exposures().exptime
     noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
-    shared = Sharing(model.template.cameras.together)
+    shared = FluxGroups(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
     responses = []
@@ -280,7 +280,7 @@ class Illumination(NamedTuple):
     flux: Float[np.ndarray, " p"]
     noise: simulation.PhotonNoise
     floor: float
-    shared: Sharing
+    shared: FluxGroups
     weight: Float[np.ndarray, " p"]
     scatter: Mapping[int, float] = MappingProxyType({})
     errors: tuple[Float[Any, " *k"], Float[Any, " *k"]] = (np.ones(()), np.zeros(()))
@@ -304,7 +304,7 @@ class Illumination(NamedTuple):
         projected = project_flux(columns, unit * weight, False, self.shared)
         if any(self.scatter.values()):
             stars = np.stack([size * projected[place] for place, size in self.scatter.items()], axis=-1)
-            alone = Sharing(stars=of_low_rank(stars[:, :, None]))
+            alone = FluxGroups(stars=of_low_rank(stars[:, :, None]))
             projected = alone.independent(projected[..., None, :])[..., 0, :]
         projected = projected * np.sqrt(self.weight)[:, None, None]
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)

@@ -489,8 +489,13 @@ def least_budget(experiment: Experiment, value: float, *, gap: float = GAP) -> t
     return plan, least
 
 
-def worth(experiment: Experiment, plan: Allocation) -> tuple[dict[Key, float], dict[Key, float]]:
-    """The criterion without each candidate of a plan, and with one more of it, over that of the plan."""
+def criterion_without_and_with(
+    experiment: Experiment, plan: Allocation
+) -> tuple[dict[Key, float], dict[Key, float]]:
+    """The criterion of a plan without one candidate, and with one more of it, over that of the plan as it is.
+
+    Two dictionaries by candidate: 1.2 in the first says that the error grows by 20 % without that candidate.
+    """
     some = Some(experiment.reduced(), plan.weights)
     weight, units = np.array(list(plan.weights.values())), np.eye(len(plan.weights))
     value = some.value(weight)

@@ -393,7 +393,7 @@ def largest_variance(experiment: Experiment, total: Float[np.ndarray, "r n n"]) 
 def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation, required: Weights
 ) -> Iterator[PlannedExposure]:
-    without, added = optimal.worth(experiment, best)
+    without, added = optimal.criterion_without_and_with(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, key = found.choices[line.choice], (line.choice, line.number)
         stop = _stop(choice, line)

@@ -319,7 +319,7 @@ class PosteriorSample(Drawn):
         ]
         remarks = (Doubt(Quality(0), text, blocking=False) for text in self.warnings if self.trusted)
         stars = "that of the fit, with this covariance: walop-jax check RUN" if self.trusted else ""
-        return Verdict(against=(*doubts, *remarks), subject="Posterior", stars=stars)
+        return Verdict(doubts=(*doubts, *remarks), subject="Posterior", stars=stars)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -414,7 +414,7 @@ class PosteriorSample(Drawn):
         if likelihood.plan.exposures.shared is not None:
             what = "exposures share their flux (KIND steady)"
             raise ValueError(f"{what}: their rows cannot be left out one by one")
-        if not likelihood.sharing.single:
+        if not likelihood.flux_groups.single:
             what = "exposures share q and u of the stars of a field (SCATTER of SOURCES)"
             raise ValueError(f"{what}: their rows cannot be left out one by one")
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)

@@ -18,7 +18,7 @@ from walop_jax.data.clipped import read_clipped
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.parameter_table import Fitted
-from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
@@ -152,7 +152,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             what = f"{model.names[int(np.argmax(away))]} moves by {np.max(away):.2g} standard errors"
             raise fail(f"fitted again, {what}", file=self.folder, advice=advice)
         if calibration.verdict.errors_from != STATED:
-            result = with_honest_errors(result)
+            result = with_empirical_covariance(result)
         verdict = calibration.verdict
         if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
             errors = {

@@ -22,7 +22,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
-from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
@@ -327,7 +327,7 @@ class _Application:
         r = np.flatnonzero(good[block.star])
         if not r.size:
             return []
-        rows, shared = block.rows[r], Sharing(vectors.instrument.cameras.together)
+        rows, shared = block.rows[r], FluxGroups(vectors.instrument.cameras.together)
         sigma, counts = block.sigma[r], self.counts[rows]
         used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
         root = np.where(used, 1.0 / np.where(used, sigma, 1.0), 0.0)

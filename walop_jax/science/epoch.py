@@ -39,7 +39,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS
 from walop_jax.fit.model_of_set import model_like
-from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
@@ -234,7 +234,7 @@ def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
     start = model.start.copy()
     for name in shared_parameters(old.model, model):
         start[model.index(name)] = old.values[old.model.index(name)]
-    result = with_honest_errors(fit(Likelihood.of(calset, model), start=start))
+    result = with_empirical_covariance(fit(Likelihood.of(calset, model), start=start))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
     return result

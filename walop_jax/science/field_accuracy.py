@@ -20,7 +20,7 @@ from walop_jax.calibration.accuracy import (
     SHARE,
     SIZE,
     TOLERANCE,
-    judged,
+    field_measured,
     measures_u,
     p_errors,
     p_forms,
@@ -86,9 +86,9 @@ class FieldAccuracy:
         return reached(self.error if self.with_u is None else self.error[self.with_u])
 
     @property
-    def judged(self) -> str:
+    def field_measured(self) -> str:
         """The part of the field of which `reached` is the error, in words."""
-        return judged(self.without_u)
+        return field_measured(self.without_u)
 
     @property
     def share(self) -> float:
@@ -112,7 +112,7 @@ class FieldAccuracy:
             advice = f"observe {strip} with the plate at 22.5° as well"
         if np.isnan(self.reached):
             advice = "no single exposure measures both q and u: observe with the plate at 22.5° as well"
-        asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
+        asked.append(_p_known(self.reached, allowed, self.field_measured, advice, needed=False))
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
             size, _ = beside(100 * self.hidden, 100 * self.goal)
@@ -165,7 +165,10 @@ class FieldAccuracy:
         if complete:
             no = f"no, for {len(lacks)} reason{'s' if len(lacks) > 1 else ''} above"
             lines.append(
-                (f"good for {goal}", no if lacks else f"yes: {per_cent(self.reached)} % in {self.judged}")
+                (
+                    f"good for {goal}",
+                    no if lacks else f"yes: {per_cent(self.reached)} % in {self.field_measured}",
+                )
             )
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
@@ -262,8 +265,8 @@ def for_stars(
         doubts = [*(need.doubt for need in needs if not need.met), *doubts]
     if verdict.trusted and accuracy.not_measured:  # said with its size
         said = NOT_MEASURED.partition("{")[0]
-        kept = tuple(doubt for doubt in verdict.against if not doubt.sentence.startswith(said))
-        verdict = dataclasses.replace(verdict, against=kept)
+        kept = tuple(doubt for doubt in verdict.doubts if not doubt.sentence.startswith(said))
+        verdict = dataclasses.replace(verdict, doubts=kept)
     return verdict.with_doubts(doubts, stars=dict(accuracy.facts(complete=complete))["p of a star"])
 
 

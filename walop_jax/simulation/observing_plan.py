@@ -335,7 +335,9 @@ class ObservingPlan:
         further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
         of_polariser: Any = () if self.design.polariser is None else self.polariser_angles
         angles = (*of_polariser, *[None] * self.lamps)
-        indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
+        through_polariser = [
+            dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)
+        ] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
             for f in self.filter_names
             for p in self.plate
@@ -360,7 +362,7 @@ class ObservingPlan:
             name, plate = self.filter_names[0], plates[0]
             field = Stop(None, name, plate, further[0], kind="standard", number=self.standards)
             sky += [field] * self.zero_exposures
-        return (*indoors, *sky)
+        return (*through_polariser, *sky)
 
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""

@@ -27,9 +27,9 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     Scalar,
     SlotTerm,
     Term,
@@ -235,7 +235,9 @@ _TESTS = {
     "afterglow": "a dark exposure after a bright one",
     "light": "the same field points at another flux, and darks",
 }
-KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()}
+KINDS |= {
+    name: ChangeKind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()
+}
 
 
 def cameras_of(instrument: Instrument, place: str) -> Weights:

@@ -1,16 +1,17 @@
 """A change of an instrument with one amplitude: a kind, at a place, with factors.
 
-    KIND PREPOSITION PLACE [* FACTOR ...]
+    KIND RELATION PLACE [* FACTOR ...]
 
     retardance q behind collimator * r2         a linear retarder with its axis along X, growing as r² over the field
     turn of polariser * cos 2 CLP               an axis turned by an amount that depends on its own reading
     gain of O1 * hours                          a camera that grows more sensitive
-    light of E1 in O1                           a share of the counts of one camera in another one
+    light of E1 in O1                           a fraction of the counts of one camera in another one
     polarisation q of HD_14069                  a star that differs from the catalogue
 
-An amplitude of 0 has no effect. A kind (`Kind`), defined in the file of its family (`optics`, `cameras`, `numbers`),
-holds the action of a change on an instrument. Factors (`factors`) multiply each other; without one the amplitude is the
-same everywhere.
+RELATION is a preposition: "ahead of", "behind", "of" or "in" (`Change.where`); PLACE is the name of an element, a
+camera or a star (`Change.place`). An amplitude of 0 changes nothing. The kind of a change (`ChangeKind`), defined in
+the file of its family (`optics`, `cameras`, `numbers`), says what a change does to an instrument. Factors (`factors`)
+multiply each other; without a factor the amplitude is the same everywhere.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def itself(stage: str) -> SlotTerms:
 
 
 @dataclasses.dataclass(frozen=True)
-class Kind:
+class ChangeKind:
     """A kind of change: one of `AMPLITUDES`, its patch of an instrument, the observation that would test it.
 
     Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise
@@ -130,7 +131,7 @@ class Kind:
 
 OF_CAMERAS = ("gain", "reported gain", "light", "afterglow")
 """Kinds of changes of counts."""
-KINDS: dict[str, Kind] = {}
+KINDS: dict[str, ChangeKind] = {}
 """All kinds by their names, which begin the texts of their changes; filled by the files of their families."""
 
 
@@ -179,7 +180,7 @@ class Change:
         return dataclasses.replace(self, units=units)
 
     @property
-    def of_stars(self) -> bool:
+    def applies_to_catalogue(self) -> bool:
         """True if its effect on a star depends on the counts and the place of the star alone."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(

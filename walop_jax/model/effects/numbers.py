@@ -14,9 +14,9 @@ from walop_jax.model.effects.change import (
     SKY,
     SLOW,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     SlotTerm,
     Term,
     add,
@@ -155,21 +155,23 @@ def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Numbers of wave plates and of their layers (µm, deg), with their amplitudes."""
 KINDS |= {
-    name: Kind(amplitude, _number, grows=_with_ray, slots=itself("number"))
+    name: ChangeKind(amplitude, _number, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()
 }
 OF_POLARISER = ("extinction", "ellipticity")
-KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
+KINDS |= {name: ChangeKind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
 _ALONE = Grows(tried=(Combinations(),))
-KINDS["shift"] = Kind(
+KINDS["shift"] = ChangeKind(
     "wavelength", _of_instrument, test=_OF_BAND, grows=lambda *_: _ALONE, slots=itself("whole")
 )
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
-KINDS["degree"] = Kind("share", _of_instrument, test="standards of another catalogue", slots=itself("light"))
-KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
+KINDS["degree"] = ChangeKind(
+    "share", _of_instrument, test="standards of another catalogue", slots=itself("light")
+)
+KINDS["rotator"] = ChangeKind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
 KINDS |= {
-    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
+    name: ChangeKind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
     for name in OF_SOURCES
 }

@@ -27,9 +27,9 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     Scalar,
     SlotTerm,
     Term,
@@ -325,12 +325,13 @@ _OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {"turn": "ang
 _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
 _OPTICAL |= {f"depolarisation{axis}": "share" for axis in ("", " q", " u", " v")}
 KINDS |= {
-    name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
+    name: ChangeKind(amplitude, _optics, _at, grows=_grows, slots=_slots)
+    for name, amplitude in _OPTICAL.items()
 }
-KINDS |= {name: Kind("share", _added, _at, grows=_grows_added, slots=itself("light")) for name in ADDED}
+KINDS |= {name: ChangeKind("share", _added, _at, grows=_grows_added, slots=itself("light")) for name in ADDED}
 _OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
 KINDS |= {
-    name: Kind(
+    name: ChangeKind(
         "displacement",
         _displaced,
         lambda change: change.place,
@@ -341,7 +342,7 @@ KINDS |= {
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
-KINDS["fringes"] = Kind(
+KINDS["fringes"] = ChangeKind(
     "share",
     _fringes,
     test=_OF_FRINGES,
