@@ -80,7 +80,7 @@ def both_ends_meet(instrument: Instrument, stages: tuple[LightStage, ...]) -> No
         cameras = [instrument.cameras.names.index(name) for name in arm.analyser.cameras]
         seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(beam))[:, 0]
         np.testing.assert_allclose(
-            named(stages, "analysers")[0, cameras], arm.analyser.shares() @ seen, rtol=0, atol=1e-14
+            named(stages, "analysers")[0, cameras], arm.analyser.beam_weights() @ seen, rtol=0, atol=1e-14
         )
 
 

@@ -161,7 +161,7 @@ def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     prefixes: set[str] = set()
     for change in _changes(effect, bare):
         moved = {moving[name] for name in change.place.split(".") if name in moving}
-        if change.where in ("ahead of", "behind") or not moved:
+        if change.relation in ("ahead of", "behind") or not moved:
             return frozenset()
         prefixes |= moved
     return frozenset(prefixes)

@@ -139,7 +139,9 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vec
     laws: dict[_Place, dict[tuple[str, ...], None]] = {}
     for change, amplitude in described.terms():
         optical = change.kind.partition(" ")[0] in _OPTICS
-        place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
+        place = _Place(
+            GENERATORS if optical else (change.kind,), change.relation, change.place, change.origin
+        )
         parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
         for _, coefficient, factors in parts:
             size = float(amplitude) * coefficient * data.rms(change.times(*factors))

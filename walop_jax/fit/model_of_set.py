@@ -80,7 +80,7 @@ class ModelFile(Displayed):
         where = self.model.name if self.path is None else self.path
         parameters, free = self.model.parameters, len(self.model.free)
         rows = tuple(
-            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, prior, p.state, p.about)
+            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, prior, p.freedom, p.about)
             for p in sorted(parameters, key=lambda p: p.name.startswith("standard."))
             for prior in ("" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1]),)
             if p.part != THROUGHPUT

@@ -125,4 +125,4 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
 
 
 def _state(p: Parameter, idle: tuple[str, ...]) -> str:
-    return p.state or (PRIOR_WORDS if p.name in idle else "")
+    return p.freedom or (PRIOR_WORDS if p.name in idle else "")

@@ -28,7 +28,7 @@ from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import of_low_rank
 from walop_jax.likelihood.noise import NoiseTerms, variance_ratio
 from walop_jax.model import light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
@@ -223,9 +223,10 @@ def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "
 class PointReader:
     """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
 
-    No error is taken to be smaller than a share of the mean counts of its row (`Cameras.floor`); `instrument` gives
-    that, and how stars of a field that differ look in the cameras. `noise` are terms of the errors at known values: the
-    errors are those that the terms make of the stated ones; None: the stated ones.
+    No error is smaller than the fraction `Cameras.noise_floor` of the mean counts of its row. `instrument` holds that
+    fraction, and the responses of the cameras to stars of one field that differ in q, u. `noise` are terms of the
+    errors at known values: the errors of the data are then those that the terms make of the stated ones; with None they
+    are the stated ones.
     """
 
     calset: CalibrationSet
@@ -252,7 +253,7 @@ class PointReader:
     def point_data(self, block: Block) -> PointData:
         """A block of measurements as the engine wants it."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
+        sigma = with_noise_floor(block.sigma, block.counts, self.instrument.cameras.noise_floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         if self.noise is not None:
             weight = weight / np.sqrt(variance_ratio(self.noise, self.noise_terms, block.counts, weight))

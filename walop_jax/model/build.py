@@ -93,7 +93,7 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     cameras = [camera for beam in beams for camera in beam]
     if sorted(cameras) != list(range(len(names))):
         raise fault("cameras", f"every camera must be behind exactly one analyser: {', '.join(names)}")
-    return Cameras(names=names, arms=tuple(beams), split=description.split, floor=description.floor)
+    return Cameras(names=names, arms=tuple(beams), split=description.split, noise_floor=description.floor)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,7 @@
 parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
 
 Not all of an instrument is valid for exposures other than the fitted ones. The instrument matrix and the analysis of a
-catalogue use the optics and the cameras. Light of the opposite field point, shares of single exposures, optics that
+catalogue use the optics and the cameras. Light of the opposite field point, changes of single exposures, optics that
 change with the time since the first exposure and detectors that depend on their exposure do not carry over; the
 response of a detector to its own counts, which may differ over the field, is inverted. Patching shows the effects
 concerned; they are not declared.
@@ -39,7 +39,7 @@ AT = 0.11, 0.07
 
 
 class Needs(NamedTuple):
-    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow."""
+    """Requirements on a plan: conditions of the optics, median counts, fringes that nodes must follow."""
 
     conditions: frozenset[str]
     smooth: frozenset[str]  # those on which the optics depend smoothly
@@ -68,7 +68,7 @@ def needs(instrument: Instrument) -> Needs:
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
-    """Shapes of a computation with all quantities that it asks for, and their names."""
+    """The shapes of the result of a computation, and the names of all quantities that it asks for on the way."""
     quantities: frozenset[str] = frozenset()
     while True:
         try:
@@ -155,7 +155,9 @@ class _Unknown(ExposureArrays):
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
-    """True for a detector that depends on its own counts and the field, so that catalogues can be corrected for it."""
+    """True for a detector that depends only on its own counts and the field point, so that catalogues can be corrected
+    for it.
+    """
     counts, at = jnp.ones((1, cameras)), tuple(map(jnp.asarray, AT))
     try:
         jax.eval_shape(lambda p: p.reported(counts, blank(_Unknown), *at), part)

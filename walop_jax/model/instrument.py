@@ -85,7 +85,7 @@ class Instrument(LightPath):
 
     @property
     def units(self) -> Units:
-        """Scales of changes over its field and its bands."""
+        """The scales of this instrument, in which changes over its field (deg) and its bands (µm) are counted."""
         return Units(self.throughput.scale, self.wavelength)
 
     def mueller(
@@ -115,7 +115,7 @@ class Instrument(LightPath):
         )
         state = tuple(angles.get(prefix) for prefix in moving)
         path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, moving, [state])
-        ahead, *inside = path.in_first_state()
+        ahead, *inside = path.in_first_setting()
         of_arm = []
         for behind in inside:
             matrix = fold.product((*ahead, *behind))
@@ -196,7 +196,7 @@ def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
 
 
 def sources() -> tuple[Source, ...]:
-    """The sources of every instrument."""
+    """The sources that every instrument has: moonlit sky, standards, light through the polariser, lamps, known flux."""
     return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
 
 

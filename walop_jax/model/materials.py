@@ -62,7 +62,7 @@ MGF2_THERMAL = 5.37e-5
 REFERENCE_TEMPERATURE = 10.0  # Celsius
 
 
-EXTRAPOLATED = 1.25
+EXTRAPOLATED = 1.25  # times beyond the measured wavelengths up to which an index is used, with a remark
 
 
 class Crystal(NamedTuple):
@@ -83,7 +83,7 @@ class Crystal(NamedTuple):
 
 
 class Glass(NamedTuple):
-    """An isotropic material; `measured` as of a crystal."""
+    """An isotropic material; `measured` is the range of wavelengths (µm) to which its curve was fitted."""
 
     dispersion: Sellmeier
     measured: tuple[float, float]

@@ -17,8 +17,9 @@ Scalar = Float[Array, "..."]
 Matrix2 = Inexact[Array, "2 2 ..."]
 
 computed_once = jax.lax.optimization_barrier
-"""Values that XLA is to compute once: by itself it computes a cheap one in every loop that asks for it, and cheap ones
-from cheap ones grow to loops of a thousand operations, compiled as often as there are elements of a matrix."""
+"""Marks values that XLA is to compute once. By itself XLA repeats a cheap computation in every loop that uses its
+result; cheap results made of cheap results then grow to loops of a thousand operations, which are compiled as often as
+a matrix has elements."""
 
 
 def matrix2(*elements: Inexact[Array, ...]) -> Matrix2:
@@ -45,7 +46,11 @@ def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
 
 
 def product(matrices: Iterable[Float[Array, "... 4 4"] | None]) -> Float[Array, "... 4 4"] | None:
-    """Product of Mueller matrices in the order of the light path; None: the identity."""
+    """Product of Mueller matrices given in the order in which light meets the elements; None among them is the
+    identity.
+
+    None comes back if all of them are None.
+    """
     result = None
     for matrix in matrices:
         if matrix is not None:

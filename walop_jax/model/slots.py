@@ -235,7 +235,7 @@ def _summed(
 
     def path_of(instrument: Instrument) -> fold.Fold:
         ray = Ray.entering(*at, (stretch * light.node_wavelengths(instrument, plan), conditions))
-        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
+        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.positions)
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
         changed = moved(sizes)

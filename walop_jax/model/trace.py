@@ -88,15 +88,15 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     # One Stokes vector per node, and its average over the band.
     wavelength, weight = light.node_wavelengths(instrument, plan), light.band_weights(instrument, plan)[0]
     ray = Ray.entering(x, y, (wavelength, plan.conditions))
-    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
-    ahead, *inside = path.in_first_state()
+    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.positions)
+    ahead, *inside = path.in_first_setting()
     nodes = jnp.broadcast_to(beam, (len(wavelength), 4))
     for (element, _), matrix in zip(path.common, ahead, strict=True):
         nodes = _through(matrix, nodes)
         if matrix is not None or element.moves:
             about = element.__doc__ or ""
             if element.moves is not None:
-                (angle,) = fold.positions(element, plan.moving, plan.states[:1])
+                (angle,) = fold.angles_of(element, plan.moving, plan.positions[:1])
                 about = "out of the beam" if angle is None else f"at {angle:g}°"
             stages.append(_one(element.name, about, weight @ nodes))
     of_arms = [

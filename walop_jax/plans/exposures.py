@@ -31,7 +31,7 @@ from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.likelihood.noise import NoiseTerms, factors
 from walop_jax.model import light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
@@ -123,7 +123,7 @@ def candidates(
             values[:, i] = p.start
     likelihood = Likelihood.of(calset, model)
     flux, exptime = simulation.fluxes(plan, None), plan.exposures().exptime
-    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
+    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.noise_floor
     shared = FluxGroups(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
@@ -269,12 +269,12 @@ def errors_of(
 
 
 class Illumination(NamedTuple):
-    """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
+    """Light of an exposure at the points of a plan: `flux` (electron, p), noise, and the cameras that share a flux.
 
-    No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `weight`
-    is for how many points of the plan each of them stands. `scatter` is the rms of single stars around a parameter, by
-    its place; each exposure counts as one of other stars. `errors` are s² and f² of the cameras in
-    σ² = s² N_ERR² + f² N².
+    No error is smaller than the fraction `floor` of the mean counts of all cameras, as in a fit
+    (`Cameras.noise_floor`). `weight` (p) is the number of points of the plan that each point stands for. `scatter` is
+    the rms of single stars around a parameter, by the position of that parameter; each exposure counts as one of other
+    stars. `errors` are s² and f² of the cameras in σ² = s² N_ERR² + f² N².
     """
 
     flux: Float[np.ndarray, " p"]
@@ -290,7 +290,7 @@ class Illumination(NamedTuple):
         shape = [1] * counts.ndim
         shape[axis] = -1
         squared, added = (np.reshape(factor, shape) for factor in self.errors)
-        stated = with_floor(self.noise.sigma(counts), counts, self.floor, axis)
+        stated = with_noise_floor(self.noise.sigma(counts), counts, self.floor, axis)
         return np.sqrt(squared * stated**2 + added * counts**2)
 
     def information(

@@ -21,7 +21,7 @@ from walop_jax.io.text import rounded
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
@@ -248,9 +248,9 @@ def simulate(
         true_error = np.hypot(plan.noise_scale * stated, plan.noise_fraction * expected)
         if (plan.noise_scale, plan.noise_fraction) != (1.0, 0.0):
             counts = expected + (counts - expected) * true_error / stated
-        if floor := truth.cameras.floor:
+        if floor := truth.cameras.noise_floor:
             # Noise up to the errors that fits take the cameras to have; N_ERR has it not.
-            beyond = np.sqrt(with_floor(stated, expected, floor) ** 2 - stated**2)
+            beyond = np.sqrt(with_noise_floor(stated, expected, floor) ** 2 - stated**2)
             counts += beyond * noise.standard_normal(expected.shape)
     table = TableIntensities.of(blank.intensities, blank.points)
     at = table.point, table.exposure

@@ -8,7 +8,7 @@
     light of E1 in O1                           a fraction of the counts of one camera in another one
     polarisation q of HD_14069                  a star that differs from the catalogue
 
-RELATION is a preposition: "ahead of", "behind", "of" or "in" (`Change.where`); PLACE is the name of an element, a
+RELATION is a preposition: "ahead of", "behind", "of" or "in" (`Change.relation`); PLACE is the name of an element, a
 camera or a star (`Change.place`). An amplitude of 0 changes nothing. The kind of a change (`ChangeKind`), defined in
 the file of its family (`optics`, `cameras`, `numbers`), says what a change does to an instrument. Factors (`factors`)
 multiply each other; without a factor the amplitude is the same everywhere.
@@ -109,7 +109,9 @@ SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
 
 def itself(stage: str) -> SlotTerms:
     """Slots of changes with a slot of their own: without factors, at a stage of the light path."""
-    return lambda _, change: [SlotTerm((stage, change.kind, change.where, change.place), 1.0, change.factors)]
+    return lambda _, change: [
+        SlotTerm((stage, change.kind, change.relation, change.place), 1.0, change.factors)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Change:
     """
 
     kind: str
-    where: str
+    relation: str
     place: str
     factors: tuple[Given, ...] = ()
     origin: str = ""
@@ -158,7 +160,7 @@ class Change:
     def text(self) -> str:
         """The change as it is typed."""
         origin = f" of {self.origin}" if self.origin else ""
-        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *map(str, self.factors)))
+        return " * ".join((f"{self.kind}{origin} {self.relation} {self.place}", *map(str, self.factors)))
 
     @property
     def label(self) -> str:
@@ -247,7 +249,7 @@ class Change:
             if item.depends_on not in allowed or (single and not matching):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""
-                what = f"{self.kind} {self.where} {self.place} cannot grow with {item.text!r}"
+                what = f"{self.kind} {self.relation} {self.place} cannot grow with {item.text!r}"
                 raise ValueError(f"{self.text!r}: {what}, only with {takes}{only}")
 
     def in_words(self) -> str:
@@ -255,7 +257,10 @@ class Change:
         origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
         of = f" of {origin}" if origin else ""
         return ", ".join(
-            (f"{self.kind}{of} {self.where} {self.place}", *(f.in_words(self.units) for f in self.grows_with))
+            (
+                f"{self.kind}{of} {self.relation} {self.place}",
+                *(f.in_words(self.units) for f in self.grows_with),
+            )
         )
 
     @property
@@ -266,9 +271,9 @@ class Change:
             advice.append("a star dithered over the field: its ghost moves the other way")
         elif test := KINDS[self.kind].test:
             advice.append(test)
-        elif self.where == "ahead of" and "." not in self.place:
+        elif self.relation == "ahead of" and "." not in self.place:
             advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
-        elif self.where == "of":
+        elif self.relation == "of":
             advice.append("the same exposures without that element, or with it mounted turned over")
         else:
             advice.append(
@@ -288,14 +293,14 @@ def _parsed(text: str) -> tuple[str, str, str, tuple[str, ...], str]:
         )
     for text_of_factor in factors:
         factor(text_of_factor)
-    return match["kind"], match["where"], match["place"], tuple(factors), match["origin"] or ""
+    return match["kind"], match["relation"], match["place"], tuple(factors), match["origin"] or ""
 
 
 @functools.cache
 def _pattern() -> re.Pattern[str]:
     kinds = "|".join(re.escape(name) for name in sorted(KINDS, key=len, reverse=True))
     return re.compile(
-        rf"(?P<kind>{kinds})(?: of (?P<origin>\S+))? (?P<where>of|in|ahead of|behind) (?P<place>[^\s*]+)"
+        rf"(?P<kind>{kinds})(?: of (?P<origin>\S+))? (?P<relation>of|in|ahead of|behind) (?P<place>[^\s*]+)"
     )
 
 

@@ -109,9 +109,9 @@ class Deviations(Effect):
             change = _at(text).counted_in(instrument.units)
             if instrument.polariser is not None and text.startswith(f"of {instrument.polariser.name}"):
                 raise ValueError(f"deviations {text!r}: the light of stars does not pass the polariser")
-            moves = instrument.element(change.place).moves if change.where == "of" else None
+            moves = instrument.element(change.place).moves if change.relation == "of" else None
             element = Polynomials(name=self.name, moves=moves, sizes=sizes, of=change)
-            instrument = beside(instrument, element, change.where, change.place)
+            instrument = beside(instrument, element, change.relation, change.place)
         return patched(instrument, zip(map(Change.parsed, self.sentences), self.amounts, strict=True))
 
 

@@ -330,7 +330,7 @@ def _expanded(text: str, instrument: Instrument) -> Iterator[str]:
 
 def _behind(change: Change, instrument: Instrument) -> Change:
     """The same place relative to the element ahead of it, if any."""
-    if change.where != "ahead of" or change.kind.startswith("displacement"):
+    if change.relation != "ahead of" or change.kind.startswith("displacement"):
         return change
     arm, _, name = change.place.rpartition(".")
     path = next((candidate.path for candidate in instrument.arms if candidate.name == arm), instrument.path)

@@ -149,7 +149,7 @@ def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
-    return [SlotTerm(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
+    return [SlotTerm(("light", change.kind, change.relation, place, *star), 1.0, change.factors)]
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}

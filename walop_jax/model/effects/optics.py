@@ -198,7 +198,7 @@ def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scal
 
 
 def _at(change: Change) -> Hashable:
-    return change.where, change.place
+    return change.relation, change.place
 
 
 def _columns(terms: Sequence[Term]) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     if _is_ahead(instrument, change):
         single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
         return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
-    if change.where != "of":
+    if change.relation != "of":
         further = (
             Combinations(over, ("colour",)),
             Combinations(along=OF_RAY),
@@ -250,7 +250,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
     """True for changes of light from the sky alone, ahead of the polariser."""
     polariser = instrument.polariser
-    return polariser is not None and change.where == "ahead of" and change.place == polariser.name
+    return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
 
 
 def _with_sky_film(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -263,23 +263,23 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
     if with_exposure and _is_ahead(instrument, change):
         return _with_sky_film(instrument, terms)
-    if change.where == "of" and polariser is not None and change.place == polariser.name:
+    if change.relation == "of" and polariser is not None and change.place == polariser.name:
         return instrument.changed(change.place, films=lambda films: (*films, Film(**_columns(terms))))
-    moves = instrument.element(change.place).moves if change.where == "of" else None
+    moves = instrument.element(change.place).moves if change.relation == "of" else None
     element = Terms(name="described", moves=moves, **_columns(terms))
-    return beside(instrument, element, change.where, change.place)
+    return beside(instrument, element, change.relation, change.place)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """Generators at a place of the train, also growing with the wavelength; at the polariser: of the light."""
     polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
-    if polariser is None or change.place != polariser.name or change.where == "behind":
+    if polariser is None or change.place != polariser.name or change.relation == "behind":
         stage, colour = "inserted", (factors.count("colour"),)
         factors = tuple(item for item in factors if item != "colour")
-        moves = instrument.element(change.place).moves if change.where == "of" else None
+        moves = instrument.element(change.place).moves if change.relation == "of" else None
         factors = factors if moves is None else (*factors, Inside(moves))
     return [
-        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *extra))
+        SlotTerm((stage, kind, change.relation, change.place, *colour), size, (*factors, *extra))
         for kind, size, extra in generators_of(change.kind)
     ]
 
@@ -292,7 +292,7 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
     element = AddedPolarisation(name="described", **components)
-    return beside(instrument, element, terms[0][0].where, terms[0][0].place)
+    return beside(instrument, element, terms[0][0].relation, terms[0][0].place)
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
