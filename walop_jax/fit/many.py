@@ -96,7 +96,7 @@ class ManyFits(Displayed):
 
     @property
     def sigma(self) -> Float[np.ndarray, "s n"]:
-        """Standard errors of all parameters as each fit states them; 0 for frozen ones."""
+        """Standard errors (s, n) of all parameters as each fit states them; 0 for fixed parameters."""
         return np.stack([one.sigma for one in self.fits])
 
     @property

@@ -50,9 +50,9 @@ ROUGH = 0.1
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 # Sums of many terms are good to some 10⁻¹⁵ of the largest eigenvalue: the smallest is then known to ten per cent.
 LARGEST_CONDITION = 1e14
-# Shares of the predicted reduction below which λ grows and above which it falls. With 0.01 steps go to and fro across a
-# valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved keeps its λ
-# and with it a slow end: directions that the data hardly see then take forty steps.
+# Fractions of the predicted reduction below which λ grows and above which it falls. With 0.01 steps go to and fro
+# across a valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved
+# keeps its λ and with it a slow end: directions that the data hardly see then take forty steps.
 BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 
@@ -158,7 +158,7 @@ def search_of(
             current, result = candidate, RESULTS.nonfinite
             break
         lowered = current is None or candidate.objective < current.objective
-        size, accept = _judged(step, model, candidate, size)
+        size, accept = _accepted(step, model, candidate, size)
         if secant and current is not None:
             bent = _predicts_better(curvature, step, current, candidate)
             curvature = _secant(curvature, step, current, candidate)
@@ -195,10 +195,11 @@ def search_of(
 
 
 def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:
-    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
+    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with ones on its diagonal.
 
-    How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to
-    the number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
+    The condition number should not depend on how well each parameter is known by itself, only on the correlations:
+    scaling by the diagonal is the best choice up to a factor, the number of parameters (van der Sluis 1969, Numerische
+    Mathematik 14, 14).
     """
     matrix, gradient = expansion.matrix, expansion.gradient
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
@@ -232,7 +233,7 @@ def _step(
 
     The step is not a number where the matrix is singular.
     """
-    if not len(scale):  # before SciPy 1.14 nothing was solved for nothing
+    if not len(scale):  # SciPy before 1.14 fails on empty systems
         return np.zeros(0), here
     models = [here]
     if curvature is not None:
@@ -247,7 +248,7 @@ def _step(
 
 
 def _predicts_better(curvature: Matrix, step: Vector, here: Quadratic, there: Quadratic) -> bool:
-    """True if S would have made the predicted change of the objective by a step less wrong."""
+    """True if, with S, the predicted change of the objective by a step would have been less wrong."""
     wrong = there.objective - here.objective - _change(step, here)
     return abs(wrong - float(step @ curvature @ step)) < abs(wrong)
 
@@ -275,8 +276,8 @@ def _change(step: Vector, here: Quadratic) -> float:
     return float(2.0 * here.gradient @ step + step @ here.matrix @ step)
 
 
-def _judged(step: Vector, here: Quadratic | None, there: Quadratic, size: float) -> tuple[float, bool]:
-    """Size of the trust region after a step from here to there, and whether it is taken."""
+def _accepted(step: Vector, here: Quadratic | None, there: Quadratic, size: float) -> tuple[float, bool]:
+    """Size of the trust region after a step from `here` to `there`, and whether the step is taken."""
     if here is None:
         return size, True
     objective = there.objective if np.isfinite(there.objective) else np.inf

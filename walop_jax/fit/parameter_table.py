@@ -47,7 +47,7 @@ class Fitted(Result):
 
     @property
     def sigma(self) -> Vector:
-        """Standard errors of all parameters."""
+        """Standard errors (n) of all parameters, each in its unit; 0 for a fixed one."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     def __getitem__(self, name: str) -> ParameterValue:
@@ -66,7 +66,7 @@ class Fitted(Result):
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
-    """Names of the free parameters without information in the data: their error is the width of their prior."""
+    """Names of the free parameters on which the data hold no information: their error is the width of their prior."""
     return tuple(
         p.name
         for p, s in zip(model.parameters, sigma, strict=True)

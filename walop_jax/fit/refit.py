@@ -67,12 +67,12 @@ class Alternatives(Protocol):
 class FitResult(Fitted):
     """A fit, the likelihood that it maximises, and the verdict on it.
 
-    `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
-    until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
-    `errors_from` is the source of the covariance, the stated errors of the data (`STATED`) or residuals; `hidden`
-    are mistakes that the residuals would not show, None until these were examined. `alternatives` are the other models
-    that a diagnosis could not tell apart from this one: the calibration of the fit is the mean over all of them.
-    `clipped` are the rows that it left out as outliers, None if it was not asked to
+    `values` (n) and `covariance` (n, n) are of all parameters in tree order, each in its unit; fixed parameters have no
+    variance. `verdict` is None until the residuals are examined (`diagnosis.trust.examined`); to ask for `trusted`
+    before that is an error. `errors_from` is the source of the covariance: the stated errors of the data (`STATED`) or
+    the residuals. `hidden` are the errors that the data would not show, None until the residuals are examined.
+    `alternatives` are the other models that a diagnosis could not tell apart from this one: the calibration of the fit
+    is the mean over all of them. `clipped` are the rows that the fit left out as outliers, None if it was not asked to
     (`outliers.clipped`).
 
     >>> result.value("pupil.magnification")[0].__round__(2)
@@ -112,7 +112,7 @@ class FitResult(Fitted):
 
     @property
     def calset(self) -> CalibrationSet:
-        """The set that it was fitted to."""
+        """The calibration set that was fitted."""
         return self.likelihood.calset
 
     @property
@@ -177,11 +177,11 @@ class FitResult(Fitted):
         structure: Structure = NO_STRUCTURE,
         remedies: Sequence[str] = (),
     ) -> FitResult:
-        """The fit with the verdict on it, given the sentences that its residuals hold against it.
+        """The fit with the verdict on it; `doubts` are the sentences that its residuals hold against it.
 
         `noiseless` data are expected counts, those of a plan: they may scatter less than their errors. `structure` is
-        what its field points differ by. `remedies` are what would explain data that the model does not, the best
-        first: sentences that take the place of the advice to look for missing effects.
+        what its field points differ by beyond the model. `remedies` are what would explain data that the model does
+        not, the best first: sentences that take the place of the advice to look for missing effects.
         """
         verdict = Verdict(
             chi2=self.chi2,
@@ -196,11 +196,11 @@ class FitResult(Fitted):
         return dataclasses.replace(self, verdict=verdict)
 
     def with_remark(self, sentence: str) -> FitResult:
-        """The fit with a remark in its verdict, which forbids nothing."""
+        """The fit with one more sentence in its verdict, which forbids nothing."""
         return self.with_doubt(Quality(0), sentence)
 
     def with_doubt(self, bit: Quality, sentence: str) -> FitResult:
-        """The fit with one more thing against it, which forbids trust unless it has no bit."""
+        """The fit with one more doubt in its verdict; it forbids trust unless `bit` is 0."""
         verdict = self.checked_verdict()
         against = (*verdict.doubts, Doubt(bit, sentence, blocking=bool(bit)))
         return dataclasses.replace(self, verdict=dataclasses.replace(verdict, doubts=against))
@@ -234,7 +234,7 @@ class FitResult(Fitted):
         return self.likelihood.residuals(self.values)[1]
 
     def value(self, name: str) -> tuple[float, float]:
-        """Value and standard error of a parameter."""
+        """Value and standard error of a parameter, in its unit."""
         return self[name][:2]
 
     def to_arviz(self, draws: int = 1000, seed: int = 0) -> Any:
@@ -246,7 +246,9 @@ class FitResult(Fitted):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on parameters missing in its table, on unconstrained ones, and on undetectable mistakes."""
+        """Sentences on parameters missing in its table, on unconstrained ones, and on errors that the data would not
+        show.
+        """
         notes = parameter_notes(self.model, self.sigma)
         if self.hidden is None or not len(self.hidden):
             return notes
@@ -322,7 +324,7 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
     if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
         what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
         them = "it" if len(idle) == 1 else "them"
-        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
+        raise ValueError(f"{what}: fix {them} (free = false) or set a prior in the model file")
     return FitResult(
         likelihood=likelihood.with_errors_at(best.x),
         values=best.x,
@@ -334,10 +336,10 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
 
 
 def with_empirical_covariance(result: FitResult) -> FitResult:
-    """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
+    """The fit with a covariance made from its residuals where it does not explain the data (`robust`).
 
-    Only the covariance changes; the verdict is to be made anew. For reported errors: model comparison keeps the stated
-    ones.
+    A fit that explains its data comes back as it is. Only the covariance changes; the verdict is to be made anew. It is
+    for reported errors: model comparison keeps the stated ones.
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
@@ -407,7 +409,7 @@ def _doubts(
 
 
 def _of_errors(result: FitResult) -> Iterator[str]:
-    """What a fit has found of the errors of its data, in a sentence."""
+    """A sentence with the values of the fitted terms of the errors of the data; none if no term was fitted."""
     fitted = [i for i in result.model.positions(NOISE).tolist() if result.sigma[i] > 0]
     if fitted:
         terms = ", ".join(f"{result.model.names[i]} = {result[result.model.names[i]]}" for i in fitted)

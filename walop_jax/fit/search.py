@@ -34,7 +34,7 @@ LARGE_TOLERANCE = 1e-3
 
 
 def free_scales(model: Model) -> Vector:
-    """The unit in which a solver thinks of each free parameter."""
+    """The natural step (f) of each free parameter, in which a solver counts."""
     return np.array([model.parameters[i].scale for i in model.free])
 
 
@@ -78,19 +78,21 @@ def _search(
     return dataclasses.replace(minimum, x=model.full(minimum.x, first))
 
 
-def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
-    """Values that are no more than a distance (standard errors, all parameters together) from the minimum.
+def moved_within(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
+    """Values (n) that lie within `distance` of the minimum, in standard errors of all parameters together.
 
-    They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
+    `values` come back as they are if they lie within it. If no values within it are reached, the closest come back that
+    a few steps lead to.
     """
     how = {"maximum_steps": FIRST_STEPS, "tolerance": distance}
     return _search(likelihood, "closer to the data", values, 1.0, **how).x
 
 
 def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise_scale: float) -> Found:
-    """The minimum in the parameters of the errors as well, from that with errors held at the start values `first`.
+    """The minimum in all parameters, those of the errors of the data included.
 
-    Scales begin where they would make χ²/dof of the residuals 1.
+    `best` is the minimum with these errors held at the start values `first`. Scales begin where they would make χ²/dof
+    of the residuals 1.
     """
     model, expansion, start = likelihood.model, best.expansion, best.x.copy()
     noise, at = model.template.noise, model.positions(NOISE)
@@ -163,7 +165,7 @@ def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
 ) -> Found:
-    """The minimum from start values that may be far away, the errors of the data scaled if need be."""
+    """The minimum of a search from start values that may be far away; if the model is poor, `_far_off` takes over."""
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
@@ -181,7 +183,9 @@ def _from_afar(
 
 
 def _far_off(likelihood: Likelihood, best: Found) -> Found:
-    """The best minimum of a model far from its data: errors scaled to the residuals, plates a wave off tried."""
+    """The best minimum of a model that does not fit: errors scaled to the residuals, and plates tried a wave thicker or
+    thinner.
+    """
     budget, starts = most_passes(likelihood.model) - best.steps, 1
 
     def search(label: str, values: Vector, scale: float, maximum_steps: int) -> Found:

@@ -85,10 +85,11 @@ REMEDIES: Mapping[Quality, str] = {
 
 @dataclasses.dataclass(frozen=True)
 class Doubt:
-    """A doubt: a bit of `Quality`, a sentence for the user, whether it forbids trust, its effect and its remedy.
+    """One thing that a verdict holds against a result: a sentence, whether it forbids trust, its size, its remedy.
 
-    One that forbids nothing is a reservation; without a bit it is a remark. `off` is by how much it makes q or u of
-    stars wrong, or uncertain, as a fraction (None: not known).
+    `bit` is its bit in QUALITY. A doubt that is not `blocking` is a reservation; without a bit it is a remark. `off` is
+    by how much it makes q or u of stars wrong, or uncertain, as a fraction (0.001 is 0.1 %; None: not known). Example:
+    "the model does not explain the data: χ²/dof = 3, where 1 is expected".
     """
 
     bit: Quality
@@ -132,9 +133,9 @@ class Doubt:
 class Structure:
     """Differences between field points that are finer than the model, rms over points and cameras.
 
-    `gain` is that of the gain of a camera (a share of its counts), `response` that of its response to fully polarised
-    light (a share of the counts as well); 0 where residuals show none. Standard errors of everything that is seen at
-    one place of the field hold them: no average over exposures makes them smaller.
+    `gain` is the rms of the gain of a camera, as a fraction of its counts; `response` the rms of its response to fully
+    polarised light, as a fraction of the counts as well; both are 0 where the residuals show none. Standard errors of
+    everything that is seen at one place of the field hold them: no average over exposures makes them smaller.
     """
 
     gain: float = 0.0
@@ -148,18 +149,21 @@ NO_STRUCTURE = Structure()
 NOT_MEASURED = (
     "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
-"""Remark on mistakes without information in the data, at their usual sizes."""
+"""Remark on errors on which the data hold no information, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
-"""Kinds of mistakes that could hide: of the model of the instrument, of numbers that the set states."""
+"""Kinds of undetected errors: of the model of the instrument, of numbers that the set states."""
 
 
 class UndetectedError(NamedTuple):
-    """A mistake that the data would not show.
+    """A systematic error that the data would not show: of the model of the instrument, or of a number that the set
+    states.
 
-    Its `size` in `unit` would just have been found, or is the largest plausible one. `kind` is `EFFECT` or `DATA`,
-    `remedy` a measurement that would show it. What acts on starlight itself is an effect that the model has not: `acts`
-    holds it at its size, as JSON of name and values, "" for all others. It is not `measured` where the data hold no
-    information on it at all.
+    At `size`, in `unit`, it would just have been found, or it is the largest that is plausible. `kind` is `EFFECT` or
+    `DATA`, `remedy` a measurement that would show it. An effect that acts on starlight itself and that the model has
+    not is held by `acts` at its size, as JSON of name and values; `acts` is "" for all others. `measured` is False
+    where the data hold no information on it at all.
+
+    Example: an error of the angles of the standards (size 0.3, unit deg, kind DATA).
     """
 
     name: str
@@ -173,10 +177,10 @@ class UndetectedError(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hidden:
-    """Single mistakes that the data would not show.
+    """The systematic errors that the data would not show, each one by itself.
 
-    `changes` are what each does to the parameters of the model, all of them in tree order. The largest effect of any of
-    them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
+    `changes` (s, n) are what each of them does to the parameters of the model, in tree order. The largest effect of any
+    of them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
     """
 
     errors: tuple[UndetectedError, ...]
@@ -186,7 +190,7 @@ class Hidden:
         return len(self.errors)
 
     def not_measured(self) -> tuple[str, ...]:
-        """Names of all unmeasured mistakes, each with the measurement to take."""
+        """Names of the errors on which the data hold no information, each with the measurement to take."""
         together: dict[str, list[str]] = {}
         for error in self.errors:
             if not error.measured:
@@ -195,7 +199,7 @@ class Hidden:
         return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
-        """The worst of them in a sentence."""
+        """A sentence on the worst of them, `most` by name."""
         sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.errors]
         return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
@@ -239,9 +243,10 @@ class Verdict(Displayed):
 
     @classmethod
     def recorded(cls, *, trusted: bool, quality: int, warnings: Sequence[str] = (), **others: Any) -> Verdict:
-        """The verdict that a file states, which relates no sentence to a bit: all bits are those of the first one.
+        """The verdict that a file states.
 
-        Of a fit that is not trusted that is the first reason against it.
+        A file does not say which sentence belongs to which bit: all bits go to the first doubt. If the fit is not
+        trusted, the first sentence is the reason.
         """
         said = [*warnings]
         bits = Quality(quality)
@@ -257,7 +262,7 @@ class Verdict(Displayed):
         stars: str = "",
         parts: Mapping[str, VerdictPart] | None = None,
     ) -> Verdict:
-        """The verdict with more against it, each sentence once."""
+        """The verdict with further doubts, each sentence once."""
         kept, said = [*self.doubts], {doubt.sentence for doubt in self.doubts}
         for doubt in doubts:
             if doubt.sentence not in said or not doubt.sentence:
@@ -281,7 +286,7 @@ class Verdict(Displayed):
 
     @property
     def go(self) -> bool:
-        """The same, as the answer to the question whether it can be used for stars."""
+        """True if the result can be used for stars: the same as `trusted`."""
         return self.trusted
 
     @property
@@ -329,7 +334,7 @@ class Verdict(Displayed):
 
     @property
     def first_facts(self) -> tuple[tuple[str, str], ...]:
-        """The lines below: what it means for p of a star, and all further reasons."""
+        """The lines below the first: what the verdict means for p of a star, and all further reasons."""
         others = [f"{doubt.words}" for doubt in self.reasons[1:]] or ["nothing else"]
         unknown = "not known" if self.trusted else "not known: it is not to be used"
         return ("p of a star", self.stars or unknown), *zip(

@@ -72,7 +72,10 @@ def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -
 def own_columns(
     likelihood: Likelihood, values: Vector, effects: Sequence[Effect]
 ) -> Float[np.ndarray, "d a"]:
-    """The same for effects of a user's own, by differentiation; those that differ in numbers alone share a program."""
+    """The same derivatives for effects of a user's own, by differentiation of their `patch`.
+
+    Effects that differ in their numbers alone use one program.
+    """
     columns, plans = [], {}
     for effect in effects:
         structure = jax.tree.structure(effect)
@@ -121,7 +124,7 @@ class _AtPoint(NamedTuple):
 
     vectors: VectorSlopes  # leading axis: sites
     light: LightSlopes
-    share: Float[Array, "m e k"]  # of the counts at a site that a camera sees
+    share: Float[Array, "m e k"]  # fraction of the counts at a site that a camera sees
     counts: Float[Array, "m e k"]  # for light of unit flux at the sites, ahead of ghosts
     opposite: Float[Array, "e k"]  # of extended sources
     flux: Float[Array, "e f"]
@@ -160,7 +163,7 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
 
 
 def _visibilities(instrument: Instrument, plan: Plan, gaps: Float[Array, " g"]) -> Float[Array, " g"]:
-    """Share of the fringes of air that the band leaves of them that blurs them least."""
+    """Contrast of the fringes of air gaps in the band that blurs them least, 0 to 1."""
     phase = 4.0 * jnp.pi * gaps[:, None] / light.node_wavelengths(instrument, plan)
     weight = light.band_weights(instrument, plan)
     real, imaginary = jnp.cos(phase) @ weight.T, jnp.sin(phase) @ weight.T
@@ -175,7 +178,7 @@ def _pushed(
     x: Float[Array, " p"],
     y: Float[Array, " p"],
 ) -> Float[Array, "a p e k"]:
-    """Change of the counts that the detectors report, for counts that change."""
+    """Change of the counts that the detectors report, for changes (a, p, e, k) of the counts that arrive."""
 
     def at(
         counts: Float[Array, "e k"], change: Float[Array, "e k"], x: Float[Array, ""], y: Float[Array, ""]

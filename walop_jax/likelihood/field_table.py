@@ -76,7 +76,7 @@ class FieldTable(eqx.Module):
         return (across[..., :, None] * along[..., None, :]).reshape(*across.shape[:-1], -1)
 
     def __call__(self, x: Float[Any, "*p"], y: Float[Any, "*p"]) -> Tree:
-        """The functions at field positions (deg); arrays of numpy give such."""
+        """The functions at field positions (deg); arrays of numpy give arrays of numpy."""
         xp, basis = (jnp if isinstance(x, jax.Array) else np), self.basis(x, y)
         return jax.tree.map(lambda leaf: xp.tensordot(basis, leaf, 1), self.coefficients)
 
@@ -171,7 +171,7 @@ def in_batches(
     """Results of `solve` for the rows of columns, a tree of arrays, `size` rows at a time, as it is compiled for."""
 
     def solved(start: int) -> Any:
-        # The last batch is filled up with its last row, which keeps the arithmetic as tame as that of the data.
+        # The last batch is filled up with its last row, so that padding cannot overflow or give NaN.
         rows = np.minimum(np.arange(start, start + size), len(columns[0]) - 1)
         return jax.tree.map(np.asarray, solve(*(column[rows] for column in columns)))
 

@@ -7,8 +7,8 @@ Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse
             is exact, and JᵀJ is the Fisher information with the flux marginalised; a star of a field that is off by
             δ ~ N(0, 1) in a direction adds A Aᵀ to the covariance of its r, A = ∂r/∂δ, and r ← (1 + A Aᵀ)^(−1/2) r
             as well as d makes them independent again (`inverses.of_low_rank`)
-Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
-            (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`FluxGroups`)
+Limits      where the flux is known, F = 1 and nothing is projected; where the fractions of the light in the arms are
+            unknown (`Cameras.split`), y·a and a·a run over the cameras and exposures of one flux (`FluxGroups`)
 """
 
 from __future__ import annotations
@@ -28,10 +28,15 @@ def namespace(*arrays: Any) -> ModuleType:
 
 
 class FluxGroups(NamedTuple):
-    """Common fluxes: `cameras` is 1 where two of them share one, `exposures` where one is of a group that does.
+    """Which intensities of a field point have one unknown flux in common.
 
-    None: all cameras; every exposure for itself. `stars` is U of 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2) at a point, where the
-    exposures of a star have its own q, u in common; None: no star differs from its catalogue.
+    `cameras[k, l]` is 1 if cameras k and l have one flux; None: all cameras have one. `exposures[e, g]` is 1 if
+    exposure e belongs to flux group g; None: every exposure has a flux of its own. `FluxGroups()` is the usual case: a
+    flux for each exposure, the same for all cameras. A steady lamp seen in three exposures is one group: a column of
+    three ones.
+
+    `stars` is for stars of a field that differ from its mean q, u in all exposures of a point alike: the matrix U of 1
+    − U Uᵀ = (1 + A Aᵀ)^(−1/2) at each point (`Source` in the head of this file); None: no star differs.
     """
 
     cameras: Float[Any, "k k"] | None = None
@@ -44,7 +49,9 @@ class FluxGroups(NamedTuple):
         return self.exposures is None and self.stars is None
 
     def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
-        """Sums over intensities with a common flux, once for all cameras (f = 1) or camera by camera (f = k)."""
+        """Sums over the intensities with a common flux: once for all cameras (f = 1), or for each camera the sum of its
+        group (f = k).
+        """
         by_camera = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
         if self.exposures is None:
             return by_camera
@@ -53,7 +60,7 @@ class FluxGroups(NamedTuple):
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
 
     def independent(self, values: Float[Any, "... e k"], inverse: bool = False) -> Float[Any, "... e k"]:
-        """Weighted residuals or derivatives, the flux eliminated, with errors that are independent; or back."""
+        """Weighted residuals or derivatives, the flux eliminated, made independent; `inverse` undoes it."""
         if self.stars is None:
             return values
         xp = namespace(values)

@@ -112,9 +112,10 @@ class Layout:
 
 
 def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
-    """The instrument whose retarders the wavelength nodes follow: at the start, or as thick as those of the template.
+    """The instrument whose retarders the wavelength nodes of a plan must follow.
 
-    A fit that has made them thicker than the start has put them there.
+    Its retarders are those of the start values or of the template, whichever are thicker: after a fit that has
+    thickened the plates, the template holds the fitted thicknesses.
     """
     if np.array_equal(values_of(model.template), model.start):
         return model.template
@@ -123,19 +124,21 @@ def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
 
 
 def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
-    """The curves of the filters in use."""
+    """The filter curves that the exposures of a set use."""
     names = np.unique(calset.exposures.filter).tolist()
     return [calset.filters[name] for name in names if name in calset.filters]
 
 
 def fields_of_stars(sources: Sources) -> Float[np.ndarray, "f s"]:
-    """For each field of stars that scatter their rms, in its own rows of SOURCES; 0 in those of others."""
+    """For each field of stars that scatter, a row with the rms of its stars at their rows of SOURCES, and 0 at all
+    others.
+    """
     firsts = np.unique(sources.stars[sources.scatter > 0])
     return np.where(sources.stars == firsts[:, None], sources.scatter, 0.0)
 
 
 def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
-    """The part of the field on which optics are needed; ghosts need those of the opposite points too."""
+    """The part of the field on which the optics are needed; with ghosts (`mirrored`) also at the opposite points."""
     xy = np.stack([calset.points.x, calset.points.y])
     low, high = xy.min(axis=1), xy.max(axis=1)
     if mirrored:
@@ -145,13 +148,13 @@ def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
 
 
 class BlocksOfPoints(Intensities):
-    """Runs of `length` neighbouring points of a set, beginning at the points `starts`."""
+    """A sample of a set: blocks of `length` neighbouring points, which begin at the points `starts`."""
 
     def __init__(self, whole: Intensities, starts: Int[np.ndarray, " s"], length: int) -> None:
         self.whole, self.starts, self.length = whole, starts, length
 
     def block(self, start: int, stop: int) -> Block:
-        """Return the data of the points `start:stop` of the runs, read from the whole set."""
+        """The data of the points `start:stop` of the sample, read from the whole set."""
         blocks = []
         for number in range(start // self.length, math.ceil(stop / self.length)):
             first, origin = number * self.length, int(self.starts[number])
@@ -171,10 +174,10 @@ class BlocksOfPoints(Intensities):
 
 
 def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOURS) -> CalibrationSet:
-    """A set of at most `most` of the points: runs of at least `neighbours` spread evenly over all of them.
+    """A set of at most `most` of the points: blocks of at least `neighbours` neighbours, spread evenly over the set.
 
-    There are 16 runs or more and 128 at most, so they are shorter or longer than that in a very small or a very large
-    sample. A set that is not larger than that comes back as it is.
+    There are 16 blocks or more and 128 at most, so that blocks are shorter than `neighbours` in a very small sample and
+    longer in a very large one. A set of at most `most` points comes back as it is.
     """
     n = len(calset.points)
     if n <= most:
@@ -184,20 +187,20 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     starts = _spread(n, most, length)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
-    runs = BlocksOfPoints(calset.intensities, starts, length)
-    return dataclasses.replace(calset, points=points, intensities=runs)
+    blocks = BlocksOfPoints(calset.intensities, starts, length)
+    return dataclasses.replace(calset, points=points, intensities=blocks)
 
 
 def _spread(points: int, sample: int, length: int) -> Int[np.ndarray, " s"]:
-    """The first points of runs spread evenly; multiples of the golden section are in step with no raster."""
+    """The first points of blocks spread evenly; multiples of the golden section are in step with no raster."""
     places = np.mod(np.arange(max(1, sample // length)) * 0.6180339887498949, 1.0)
     return np.unique((places * (points // length)).astype(int)) * length
 
 
 def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
-    """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
+    """Median over the field of the measured counts of each camera in each exposure (e, k); 0 where nothing is used.
 
-    Of a set with more than `limits.MEDIAN_POINTS` points, runs spread evenly over it are enough.
+    Of a set with more than `limits.MEDIAN_POINTS` points a sample is taken, blocks spread evenly over it.
     """
     n, run, limit = len(calset.points), limits.MEDIAN_RUN, limits.MEDIAN_POINTS
     starts = range(0, n, run) if n <= limit else np.linspace(0, n - run, limit // run).astype(int)
@@ -209,7 +212,7 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
 
 
 def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "e k"]:
-    """Median over the field of the counts of each camera in each exposure, NaN left out; 0 where all are."""
+    """Median over the field of the counts of each camera in each exposure (e, k), NaN left out; 0 where all are NaN."""
     measured = np.isfinite(counts[..., 0]).any(axis=0)
     median = np.zeros(counts.shape[1:])
     median[measured] = np.nanmedian(counts[:, measured], axis=0)
@@ -251,7 +254,7 @@ class PointReader:
         return batches
 
     def point_data(self, block: Block) -> PointData:
-        """A block of measurements as the engine wants it."""
+        """The point data of a block of measurements, as arrays of JAX."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
         sigma = with_noise_floor(block.sigma, block.counts, self.instrument.cameras.noise_floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
@@ -277,8 +280,8 @@ class PointReader:
         return NoiseTerms.of(noise, self.calset.exposures.kind.tolist(), self.instrument.cameras.names)
 
     def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
-        """`FluxGroups.stars` of some points: in all exposures of its point a star differs from its field by the same q,
-        u.
+        """`FluxGroups.stars` of some points (p, e, k, c): a star is off by one q and one u in all exposures of its
+        point.
         """
         share = np.asarray(star_responses(self.instrument, self.plan, array(fields), data))
         counts = np.asarray(data.counts) * np.asarray(data.weight)

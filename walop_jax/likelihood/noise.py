@@ -49,7 +49,7 @@ class NoiseTerms(NamedTuple):
 
 
 def factors(noise: Noise, terms: NoiseTerms) -> tuple[Float[Any, "e k"], Float[Any, "e k"]]:
-    """s² and f² of every exposure and camera: σ² = s² N_ERR² + f² N². Numpy where the values of the terms are."""
+    """s² and f² of every exposure and camera (e, k): σ² = s² N_ERR² + f² N². Numpy in, numpy out."""
     xp = namespace(noise.scale, noise.fraction)
     scale, fraction = xp.asarray(noise.scale), xp.asarray(noise.fraction)
     squared = xp.prod(xp.where(xp.asarray(terms.scale) > 0, (scale**2)[:, None, None], 1.0), axis=0)
@@ -71,7 +71,7 @@ def log_variance(
     flux_known: Bool[Any, " e"],
     shared: FluxGroups = ALONE,
 ) -> Float[Any, "*p e"]:
-    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²) of every row (point, exposure); of a flux of several rows each has its part.
+    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²) of every row (point, exposure); rows of one flux each have their part of it.
 
     `light` is a, of any common scale within a flux, 0 where unused.
     """

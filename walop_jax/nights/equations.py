@@ -25,7 +25,7 @@ from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import SKY_AND_STARS, gauges
 from walop_jax.fit.model_file import header_of
-from walop_jax.fit.search import nearer
+from walop_jax.fit.search import moved_within
 from walop_jax.io.errors import DataError, fail
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.columns import Change, Columns
@@ -191,7 +191,7 @@ def night_equations(
             continue
         likelihood, point = Likelihood.of(subset, model, sets=sets), values
         if own:
-            point = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
+            point = moved_within(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
             terms, _ = likelihood.data_terms(point)
             select = model.selection()
