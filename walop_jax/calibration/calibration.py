@@ -133,6 +133,11 @@ class Calibration(Fitted):
     ((6,), (6, 6))
     """
 
+    _working = (
+        "written", "with_covariance", "fitted", "widened", "of_deviations", "over_field", "new_maps", "model_lines",
+        "provenance", "matrix_columns", "raster", "curves",
+    )  # fmt: skip
+
     model: Model
     values: Vector
     covariance: Matrix

@@ -44,7 +44,7 @@ Writers = Mapping[str, str | Callable[[Path], object] | None]
 class Option:
     """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
 
-    `kind` is the type of the typed text (default: that of the annotation). `required` holds on the command line only,
+    `kind` is the type of the typed text (default: the type in the annotation). `required` holds on the command line only,
     where results that are not written would be lost. With `placed` it is an argument, known by its position.
     """
 
@@ -57,7 +57,7 @@ class Option:
     placed: bool = False
 
     def spelled(self, name: str) -> str:
-        """The word for it on the command line, where the parameter is called `name`."""
+        """The word on the command line for the parameter `name`: `--clip`, or `CALSET` for an argument."""
         return (self.metavar or name.upper()).strip("[]") if self.placed else f"--{name.replace('_', '-')}"
 
 
@@ -66,7 +66,7 @@ SHARED: Mapping[str, Option] = {
         "Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path], placed=True
     ),
     "model": Option(
-        "Model file: parameters free, tied, held; effects added.", metavar="MODEL.toml", kind=Path
+        "Model file: parameters free, fixed or tied; effects added.", metavar="MODEL.toml", kind=Path
     ),
     "instrument": Option(
         "An instrument that comes with the package, or a description file; see walop-jax instrument.",
@@ -131,7 +131,7 @@ class Job:
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def tell(self, text: str, stage: str = "") -> None:
-        """Report a step; `stage` is the one of the command that begins with it."""
+        """Report a step; `stage` is the stage of the command that begins with this step."""
         self.progress(Stage(text, stage) if stage else text)
 
     def begin(self, stage: str) -> None:
@@ -264,6 +264,13 @@ COMMON: Mapping[str, tuple[Any, str]] = {
 }  # fmt: skip
 """The parameters that every command takes in Python, with their defaults and kinds."""
 
+IN_PYTHON = {
+    "overwrite": "Replace outputs that exist.",
+    "progress": "Called with a line of text about each step; print, for example.",
+    "seed": "Seed of random numbers.",
+}
+"""What these are, for `help`."""
+
 NUMBERS = ("bool", "int", "int | None", "float", "float | None")  # annotations of parameters that are no text
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
@@ -357,7 +364,10 @@ class Command(Generic[T]):
         del call.__dict__["__wrapped__"]
         call.__signature__ = self.signature  # type: ignore[attr-defined]
         call.command = self  # type: ignore[attr-defined]
-        described = [f"{name}: {option.help}" for name, option in self.options.items()]
+        told = {name: option.help for name, option in self.options.items()} | {
+            name: help for name, help in IN_PYTHON.items() if name in self.signature.parameters
+        }
+        described = [f"{name}: {help}" for name, help in told.items()]
         call.__doc__ = python_first(inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described))
         return call
 

@@ -90,8 +90,10 @@ def refit(
     which hold what the pixels say of anything smooth. Structure that is finer is told, with its worst place. The
     calibration then holds a map of the residuals of the smooth model, as that of a set of more than 65536 points does.
 
-    In Python: the fit, whose `clipped` are the rows left out and whose `calset` has them flagged. Raises `DataError`
-    for data that cannot be trusted, ValueError for a model that does not fit.
+    In Python: a `FitResult`, with values and errors of all parameters (`result["pupil.magnification"]`,
+    `result.to_table()`), their covariance, residuals and the verdict (`result.trusted`, `result.warnings`). Nothing is
+    written unless `output` is given. `clipped` are the rows left out, and `calset` has them flagged. Raises `DataError`
+    for data that cannot be trusted, ValueError for a model that does not fit the data.
 
     >>> result = walop.refit(calset)  # doctest: +SKIP
     >>> result["pupil.magnification"]

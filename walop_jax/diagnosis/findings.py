@@ -269,7 +269,7 @@ class Diagnosis(Drawn):
     that were scored.
     """
 
-    first_figure = "ladder"
+    _first_figure = "ladder"
 
     verdict: Outcome
     steps: tuple[Step, ...]

@@ -93,8 +93,8 @@ def gauges(model: Model, flux_known: bool) -> list[str]:
     cameras = model.template.cameras
     if flux_known and not cameras.split:
         return []
-    units = tuple(f"throughput.n{camera}." for camera in cameras.ratio_references)
-    return [name for name in model.names if name.startswith(units)] if units else [GAUGE]
+    series = tuple(f"throughput.n{camera}." for camera in cameras.ratio_references)
+    return [name for name in model.names if name.startswith(series)] if series else [GAUGE]
 
 
 def instrument_of(calset: CalibrationSet) -> Instrument:

@@ -34,7 +34,9 @@ class ParameterValue(NamedTuple):
 
 
 class Fitted(Result):
-    """A model with values and a covariance of all its parameters, by name and as a table."""
+    """A model with values (n) and a covariance (n, n) of all its parameters, by name and as a table."""
+
+    _working = ("shown",)
 
     model: Model
     values: Vector

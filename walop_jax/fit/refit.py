@@ -80,6 +80,8 @@ class FitResult(Fitted):
     >>> table = result.to_table()
     """
 
+    _working = ("of", "with_verdict", "with_remark", "with_doubt", "checked_verdict")
+
     likelihood: Likelihood
     values: Vector
     covariance: Matrix

@@ -228,6 +228,8 @@ class Verdict(Displayed):
     the stated errors of the data, or the residuals (`fit.robust`).
     """
 
+    _working = ("recorded", "with_doubts", "on_top_of", "answers", "first_facts")
+
     chi2: float = float("nan")
     dof: int = 0
     n_data: int = 0

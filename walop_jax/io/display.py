@@ -113,7 +113,17 @@ def _cell(tag: str, text: str, column: str = "") -> str:
 
 
 class Displayed(abc.ABC):
-    """Something that shows itself as a short table instead of as everything that it holds."""
+    """Something that shows itself as a short table instead of as everything that it holds.
+
+    `_working` are methods by which other rooms make and change it. They are no results: `dir` leaves them out, and with
+    it the completion of names in a session.
+    """
+
+    _working: ClassVar[tuple[str, ...]] = ()
+
+    def __dir__(self) -> list[str]:
+        working = {name for cls in type(self).__mro__ for name in vars(cls).get("_working", ())}
+        return sorted(set(super().__dir__()) - working)
 
     @abc.abstractmethod
     def display(self) -> Display:
@@ -136,17 +146,17 @@ class Displayed(abc.ABC):
 class Drawn(Displayed):
     """Something of which there are figures; the class says which one to begin with."""
 
-    first_figure: ClassVar[str]
+    _first_figure: ClassVar[str]
 
     def plot(self, name: str | None = None, **options: Any) -> Any:
         """One of its figures by name; `walop_jax.plot(self)` lists them, and `options` are its."""
-        return importlib.import_module("walop_jax").plot(self, name or self.first_figure, **options)
+        return importlib.import_module("walop_jax").plot(self, name or self._first_figure, **options)
 
 
 class Result(Drawn):
     """Base class of results with a calibration, which the public functions take."""
 
-    first_figure = "matrix"
+    _first_figure = "matrix"
 
     def report(self, output: PathLike, **options: Any) -> Any:
         """Write the page about it."""

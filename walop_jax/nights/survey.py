@@ -60,7 +60,7 @@ class Survey(Drawn):
     is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of users (MJD, words).
     """
 
-    first_figure = "tracks"
+    _first_figure = "tracks"
 
     data: Together
     laws: tuple[Law | None, ...]

@@ -117,7 +117,7 @@ class Comparison(Drawn):
     whether the joint model was held against a truth there (its covariance otherwise).
     """
 
-    first_figure = "histogram"
+    _first_figure = "histogram"
 
     paper: PaperCalibration
     offsets: Offsets

@@ -273,7 +273,7 @@ class PosteriorSample(Drawn):
     `likelihood` that of its data, whose errors were taken times `noise_scale`.
     """
 
-    first_figure = "corner"
+    _first_figure = "corner"
 
     sampler: str
     names: tuple[str, ...]

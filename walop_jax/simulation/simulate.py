@@ -95,13 +95,13 @@ def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndar
     cameras = len(template.throughput.coefficients)
     level = 0.5 + LEVEL_SCATTER * rng.standard_normal(cameras)
     shape = rng.standard_normal((cameras, len(terms)))
-    share = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
-    share /= max(float(np.linalg.norm(share)), 1.0)
+    size = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
+    size /= max(float(np.linalg.norm(size)), 1.0)
     # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
-    relative = STRUCTURE * shape * share * np.sqrt(np.prod(2 * terms + 1, axis=1))
+    relative = STRUCTURE * shape * size * np.sqrt(np.prod(2 * terms + 1, axis=1))
     relative[:, 0] = 1.0
-    units = list(template.cameras.units)
-    level[units], relative[units, 1:] = level[0], 0.0
+    references = list(template.cameras.ratio_references)
+    level[references], relative[references, 1:] = level[0], 0.0
     return 0.5 * level[:, None] / level[0] * relative
 
 

@@ -373,8 +373,8 @@ def test_factors_of_single_exposures_by_hand():
     ["hours", "hours 0 to 2", "exposure 3", "kind moon", "side CLP", "order", "night hours", "per EXPTIME"],
 )
 def test_a_change_in_single_exposures_is_not_known_for_stars(given):
-    assert Change.parsed("gain of O1").of_stars
-    assert not Change.parsed(f"gain of O1 * {given}").of_stars
+    assert Change.parsed("gain of O1").applies_to_catalogue
+    assert not Change.parsed(f"gain of O1 * {given}").applies_to_catalogue
 
 
 def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sky_alone():
