@@ -44,6 +44,7 @@ from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, PathLike, nearest
+from walop_jax.io.shapes import Matrix, OfPoints, Vector
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.dependence import left_behind, needs
@@ -53,16 +54,14 @@ from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
 from walop_jax.model.planning import plan_for_settings
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
-Matrix = Float[np.ndarray, "n n"]
-Positions = Float[np.ndarray, " p"]  # deg
 Elements = Float[np.ndarray, "p m"]  # m21, m22, m23, m31, … at positions
-Covariances = Float[np.ndarray, "p m m"]
-Columns = dict[str, tuple[np.ndarray, str]]  # values, description
+MatrixCovariances = Float[np.ndarray, "p m m"]
+MatrixColumns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
 MAP_NODES = (18, 24, 30)  # per side, for the standard errors in the maps
@@ -309,7 +308,7 @@ class Calibration(Fitted):
             m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
         return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
 
-    def _elements(self, x: Positions, y: Positions, settings: Settings) -> tuple[Elements, Covariances]:
+    def _elements(self, x: OfPoints, y: OfPoints, settings: Settings) -> tuple[Elements, MatrixCovariances]:
         filters = self.curves(settings)
         if self.draws is not None:
             drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
@@ -321,8 +320,8 @@ class Calibration(Fitted):
         return values, covariance + of_structure(self.verdict.structure, values)
 
     def over_field(
-        self, x: Positions, y: Positions, settings: Settings, counts: Sequence[int], tolerance: float
-    ) -> tuple[Elements, Covariances, Float[np.ndarray, "p m n"]]:
+        self, x: OfPoints, y: OfPoints, settings: Settings, counts: Sequence[int], tolerance: float
+    ) -> tuple[Elements, MatrixCovariances, Float[np.ndarray, "p m n"]]:
         """Matrix, covariance and derivatives at many field positions (deg), interpolated (`slopes_over_field`).
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
@@ -387,7 +386,7 @@ class Calibration(Fitted):
         raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
-        self, x: Positions, y: Positions, settings: Settings, values: Elements | None = None
+        self, x: OfPoints, y: OfPoints, settings: Settings, values: Elements | None = None
     ) -> Int[np.ndarray, " p"]:
         """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
 
@@ -485,8 +484,8 @@ class Calibration(Fitted):
         }
 
     def matrix_columns(
-        self, x: Positions, y: Positions, settings: Settings, outside: Bool[np.ndarray, " p"]
-    ) -> Columns:
+        self, x: OfPoints, y: OfPoints, settings: Settings, outside: Bool[np.ndarray, " p"]
+    ) -> MatrixColumns:
         """Matrix elements, standard errors and FLAG, each with its description; NaN and 32 where `outside`."""
         inside = np.flatnonzero(~outside)
         elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
@@ -497,7 +496,7 @@ class Calibration(Fitted):
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
         names = matrix_names(values.shape[1] // 3)
         about = [f"element {name.lower()} of the instrument matrix" for name in names]
-        columns: Columns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
+        columns: MatrixColumns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:

@@ -25,8 +25,8 @@ from jaxtyping import Float
 from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrices
 from walop_jax.data.settings import Settings
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import per_cent, rounded
-from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light
 from walop_jax.model.effects import Change, Effect, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context
@@ -106,7 +106,7 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
 
 
 def hidden_errors(
-    calibration: Calibration, x: Vector, y: Vector, settings: Settings
+    calibration: Calibration, x: OfPoints, y: OfPoints, settings: Settings
 ) -> Float[np.ndarray, "s p"]:
     """Error of q and u at field positions (deg) by each mistake that could hide; NaN where u is hardly measured."""
     hidden, instrument = calibration.hidden, calibration.model.instrument(calibration.values)
@@ -231,7 +231,7 @@ def turn_of(instrument: Instrument, effect: Effect) -> float:
 
 
 def change_by_effect(
-    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: Vector, y: Vector
+    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "p a 3"]:
     """Instrument matrix with an effect at its size, less the one without, in one setting."""
     models = with_effect(instrument, effect), instrument

@@ -23,8 +23,9 @@ from walop_jax.data.grid import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Structure
+from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits, optics
-from walop_jax.likelihood.field_table import Vector, accurate_table, details_of, in_batches
+from walop_jax.likelihood.field_table import accurate_table, details_of, in_batches
 from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
@@ -180,7 +181,7 @@ _slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="
 
 
 def analysis_vectors(
-    instrument: Instrument, plan: Plan, x: Vector, y: Vector, *, from_sky: bool = False
+    instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints, *, from_sky: bool = False
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
@@ -192,7 +193,9 @@ sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 """Analysis vectors for light from the sky."""
 
 
-def vector_slopes(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p d b k 3"]:
+def vector_slopes(
+    instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints
+) -> Float[np.ndarray, "p d b k 3"]:
     """Derivatives of `sky_vectors` in all parameters but the terms of the throughput, then in the throughputs there."""
     return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
@@ -205,7 +208,7 @@ def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) 
 # ----------------------------------------------------------------------------------------------------------- the matrix
 
 
-def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Matrices:
+def planned_matrices(instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints) -> Matrices:
     """Instrument matrices at field positions (deg) in the one setting of a plan."""
     return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
 
@@ -230,7 +233,7 @@ def _matrix_and_slopes(instrument: Instrument, plan: Plan) -> Callable[..., tupl
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
-    def at(*columns: Vector) -> tuple[np.ndarray, np.ndarray]:
+    def at(*columns: OfPoints) -> tuple[np.ndarray, np.ndarray]:
         vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
         basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
@@ -246,8 +249,8 @@ def matrices(
     instrument: Instrument,
     settings: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     covariance: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
     """Elements of the instrument matrix (three for each arm) and their covariance at field positions (deg).
@@ -261,7 +264,7 @@ def matrices(
         plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
         exact = _matrix_and_slopes(instrument, plan)
 
-        def with_covariance(*columns: Vector, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+        def with_covariance(*columns: OfPoints, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
@@ -269,13 +272,18 @@ def matrices(
     return values, errors
 
 
-def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
+def _numbers(settings: Settings) -> tuple[OfPoints, OfPoints, OfPoints]:
     """Settings that enter a program as numbers: colour temperature (0: flat), temperature, hour angle."""
     return np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle
 
 
 def matrix_draws(
-    model: Model, draws: Float[np.ndarray, "d n"], settings: Settings, filters: Filters, x: Vector, y: Vector
+    model: Model,
+    draws: Float[np.ndarray, "d n"],
+    settings: Settings,
+    filters: Filters,
+    x: OfPoints,
+    y: OfPoints,
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
@@ -291,7 +299,7 @@ def matrix_draws(
 
 
 def matrix_slopes(
-    instrument: Instrument, setting: Settings, filters: Filters, x: Vector, y: Vector
+    instrument: Instrument, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
 ) -> tuple[Matrices, Slopes]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
@@ -308,8 +316,8 @@ def slopes_over_field(
     instrument: Instrument,
     setting: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     covariance: Float[np.ndarray, "n n"],
     counts: Sequence[int],
     tolerance: float,
@@ -356,8 +364,8 @@ def effect_slopes(
     instrument: Instrument,
     setting: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     effects: tuple[Effect, ...],
 ) -> Float[np.ndarray, "p a 3 e"]:
     """Derivatives of the matrix to the amplitudes of neutral effects, in order; parts outside the matrix have none."""

@@ -27,7 +27,8 @@ from walop_jax.calibration.matrix import ResidualMap, residual_names
 from walop_jax.data.cells import ORDER
 from walop_jax.data.grid import Grid
 from walop_jax.data.settings import Settings
-from walop_jax.fit.refit import FitResult, Vector
+from walop_jax.fit.refit import FitResult
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux

@@ -24,7 +24,7 @@ from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, PathLike, nearest
 from walop_jax.io.folder import NotWrittenError, OutputFolder, check_apart, output_folder
 from walop_jax.io.names import NIGHTS, PRODUCT
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, Tell
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ LOG = logging.getLogger("walop_jax")
 LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
-Tell = Callable[[str], None]
 Writers = Mapping[str, str | Callable[[Path], object] | None]
 """Texts, or writers, of files by name; None: this result has no such file."""
 
@@ -44,8 +43,8 @@ Writers = Mapping[str, str | Callable[[Path], object] | None]
 class Option:
     """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
 
-    `kind` is the type of the typed text (default: the type in the annotation). `required` holds on the command line only,
-    where results that are not written would be lost. With `placed` it is an argument, known by its position.
+    `kind` is the type of the typed text (default: the type in the annotation). `required` holds on the command line
+    only, where results that are not written would be lost. With `placed` it is an argument, known by its position.
     """
 
     help: str

@@ -29,7 +29,7 @@ NOT_CARRIED_OVER = "not_carried_over"
 """Key under which results in JSON list the effects of a model that had to be left out."""
 
 Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
-Fit: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
+FitLike: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
 CalibrationLike: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
 Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
 InstrumentLike: TypeAlias = "Instrument | PathLike | None"

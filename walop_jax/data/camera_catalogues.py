@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from walop_jax.data import plausible
 from walop_jax.data.camera_headers import (
@@ -44,10 +44,9 @@ from walop_jax.data.user_tables import (
     sky_positions,
 )
 from walop_jax.io.errors import PathLike, errors_naming, rows_text
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
-
-Numbers = Float[np.ndarray, " n"]
 
 SHIPPED = ("sextractor", "photutils")
 BAD_PIXEL = int(DataFlag.BAD_PIXEL)
@@ -98,12 +97,12 @@ class CameraCatalogue:
     """
 
     path: Path
-    ra: Numbers
-    dec: Numbers
-    flux: Numbers
-    error: Numbers
+    ra: Vector
+    dec: Vector
+    flux: Vector
+    error: Vector
     flux_name: str
-    sky: Numbers | None
+    sky: Vector | None
     flag: Int[np.ndarray, " n"]
     blended: Bool[np.ndarray, " n"]
     of_stars: Mapping[str, np.ndarray]
@@ -274,7 +273,7 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
-) -> tuple[Numbers, ...]:
+) -> tuple[Vector, ...]:
     """Fluxes, errors and the level of the sky, if there is one (electrons); without a unit they have the flux's."""
     pair = _pair(source, column_map.flux)
     unused = [other[0] for other in column_map.flux if other != pair and other[0].upper() in source.names]
@@ -312,7 +311,7 @@ def _fluxes(
     return tuple(factor * values for values in (flux, error, *sky))
 
 
-def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
+def _plain_numbers(source: InputTable, name: str, place: Place) -> Vector:
     """A column without its unit."""
     unitless = in_memory({name: np.ma.asarray(_one(source, name, place))}, str(source.path))
     return numeric_column(unitless, name.upper(), Column("float", missing=np.nan))
@@ -320,7 +319,7 @@ def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
 
 def _positions(
     source: InputTable, column_map: ColumnMap, headers: Headers, mjd: float, place: Place
-) -> tuple[Numbers, Numbers]:
+) -> tuple[Vector, Vector]:
     """Right ascension and declination (deg, ICRS), NaN where they are not known.
 
     From the sky, in the reference system of the columns or of the header, or from pixels by the WCS of the header.

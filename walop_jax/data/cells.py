@@ -41,6 +41,7 @@ from walop_jax.data.frames import Frames
 from walop_jax.data.records import Block, FineStructure, Points
 from walop_jax.data.table_intensities import SPOILT, TableIntensities, usable
 from walop_jax.data.units import Place
+from walop_jax.io.shapes import Vector
 
 CELLS = 80
 """Cells along the longer side of frames, unless the user says otherwise: parameters are within 0.05 standard errors of
@@ -59,8 +60,6 @@ _SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a
 _FEW = 0.05  # of the patches of a row of blocks: with more of them spots are no spots, and stay
 _ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it are left out there
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
-
-Vector = Float[np.ndarray, " n"]
 
 
 def orthonormal(

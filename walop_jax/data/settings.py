@@ -80,7 +80,7 @@ def builtin_filter(name: str) -> FilterCurve:
     return FilterCurve(name=name, wavelength=wavelength * 1e-4, throughput=throughput.copy())
 
 
-Rows = slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " n"]
+RowSelection = slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " n"]
 
 TEMPERATURE = 10.0
 """Temperature of the instrument (Celsius) where nothing is said of it."""
@@ -151,7 +151,7 @@ class Settings:
     def __len__(self) -> int:
         return len(self.teff)
 
-    def __getitem__(self, rows: Rows) -> Settings:
+    def __getitem__(self, rows: RowSelection) -> Settings:
         return Settings(
             *(values[rows] for values in self._plain()),
             positions={prefix: angle[rows] for prefix, angle in self.positions.items()},

@@ -52,9 +52,10 @@ from walop_jax.diagnosis.readings import (
 )
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.model_of_set import model_like
-from walop_jax.fit.refit import FitResult, Vector
+from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.io.errors import DataError
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives

@@ -30,8 +30,8 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import scipy.linalg
-from jaxtyping import Float
 
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.model.compiled import compiled
 
 SOURCE = (
@@ -39,8 +39,6 @@ SOURCE = (
     "Dennis, Gay & Welsch 1981, ACM Trans. Math. Software 7, 348"
 )
 
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 RESULTS = optx.RESULTS
 
 MAXIMUM_STEPS = 200
@@ -76,11 +74,11 @@ class Quadratic(Protocol):
         ...
 
 
-Place = TypeVar("Place", bound=Quadratic)
+AnyQuadratic = TypeVar("AnyQuadratic", bound=Quadratic)
 
 
 @dataclasses.dataclass(frozen=True)
-class Minimum(Generic[Place]):
+class Minimum(Generic[AnyQuadratic]):
     """End of a search: `x` in the units it was given, the expansion there and the gates.
 
     `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
@@ -88,7 +86,7 @@ class Minimum(Generic[Place]):
     """
 
     x: Vector
-    expansion: Place
+    expansion: AnyQuadratic
     result: optx.RESULTS
     message: str
     steps: int
@@ -104,16 +102,16 @@ class Minimum(Generic[Place]):
 
 
 def minimise(
-    evaluate: Callable[[Vector], Place],
+    evaluate: Callable[[Vector], AnyQuadratic],
     start: Vector,
     scale: Vector,
     **how: Any,
-) -> Minimum[Place]:
+) -> Minimum[AnyQuadratic]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
     `evaluate(x)` gives the objective and its expansion at x; `how` are the other arguments of `search_of`.
     """
-    search: Generator[Vector, Place, Minimum[Place]] = search_of(start, scale, **how)
+    search: Generator[Vector, AnyQuadratic, Minimum[AnyQuadratic]] = search_of(start, scale, **how)
     place = next(search)
     while True:
         try:
@@ -129,10 +127,10 @@ def search_of(
     damping: float = 1.0,
     maximum_steps: int = MAXIMUM_STEPS,
     tolerance: float = TOLERANCE,
-    far_off: Callable[[Place], bool] = lambda _: False,
+    far_off: Callable[[AnyQuadratic], bool] = lambda _: False,
     secant: bool = False,
-    progress: Callable[[int, Place], None] | None = None,
-) -> Generator[Vector, Place, Minimum[Place]]:
+    progress: Callable[[int, AnyQuadratic], None] | None = None,
+) -> Generator[Vector, AnyQuadratic, Minimum[AnyQuadratic]]:
     """The search for the minimum of a sum of squares, one place at a time: it asks for places, it is sent expansions.
 
     It yields the next place that it wants to know about, is sent the objective and its expansion there, and returns the

@@ -8,7 +8,7 @@ from typing import Any
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import SKY_AND_STARS, base_model
-from walop_jax.fit.model_file import Catalogue, ModelTable, header_of, known_to, parse, with_effects_of
+from walop_jax.fit.model_file import EffectCatalogue, ModelTable, header_of, known_to, parse, with_effects_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS, Deviations
@@ -21,7 +21,7 @@ def model_for(
     calset: CalibrationSet,
     text: str = "",
     instrument: Instrument | None = None,
-    catalogue: Catalogue = EFFECTS,
+    catalogue: EffectCatalogue = EFFECTS,
 ) -> Model:
     """The base model of a calibration set, changed by a model file (TOML text); `instrument` as for `base_model`.
 

@@ -10,9 +10,10 @@ from jaxtyping import Float
 
 from walop_jax.io.display import Display, Result
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.specification import THROUGHPUT, Model, Vector
+from walop_jax.model.specification import THROUGHPUT, Model
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
 PRIOR_WORDS = "prior only"

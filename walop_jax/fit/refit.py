@@ -29,18 +29,16 @@ from walop_jax.fit.verdict import (
     Verdict,
 )
 from walop_jax.io.display import Display
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, Tell
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.io.text import in_its_unit
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
-from walop_jax.likelihood.runner import Progress, Runner
+from walop_jax.likelihood.runner import Runner
 from walop_jax.model.noise import NOISE
 from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
-
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
@@ -422,7 +420,7 @@ def refit(
     calset: CalibrationSet,
     model: Model | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 

@@ -22,11 +22,11 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.search import free_scales
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.inverses import root_of
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Expansion, Likelihood, Matrix
-from walop_jax.model.specification import Vector
+from walop_jax.likelihood.likelihood import Expansion, Likelihood
 
 ROBUST_POINTS = 4096
 """Field points whose residuals give the errors of a fit that does not explain its data."""

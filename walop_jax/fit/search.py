@@ -15,14 +15,15 @@ import numpy as np
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Expansion, Likelihood, UsedData
 from walop_jax.model import materials
 from walop_jax.model.noise import NOISE
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 
-Found = Minimum[Expansion]
+FoundMinimum = Minimum[Expansion]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
@@ -51,7 +52,7 @@ def _search(
     near: Expansion | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
-) -> Found:
+) -> FoundMinimum:
     """The minimum from a full vector of start values, its `x` full as well; `near` is an expansion at similar ones.
 
     `how` goes to `minimise`.
@@ -88,7 +89,9 @@ def moved_within(likelihood: Likelihood, values: Vector, distance: float) -> Vec
     return _search(likelihood, "closer to the data", values, 1.0, **how).x
 
 
-def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise_scale: float) -> Found:
+def with_errors_fitted(
+    likelihood: Likelihood, best: FoundMinimum, first: Vector, noise_scale: float
+) -> FoundMinimum:
     """The minimum in all parameters, those of the errors of the data included.
 
     `best` is the minimum with these errors held at the start values `first`. Scales begin where they would make χ²/dof
@@ -118,7 +121,7 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
 
 def find_minimum(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
-) -> Found:
+) -> FoundMinimum:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
     The sample of a very large set is large itself. `noise_scale` and `target_objective` as for `refit.fit`.
@@ -136,7 +139,7 @@ def find_minimum(
     return dataclasses.replace(found, starts=best.starts)
 
 
-def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
+def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
 
     Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
@@ -164,7 +167,7 @@ def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
 
 def _from_afar(
     likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
-) -> Found:
+) -> FoundMinimum:
     """The minimum of a search from start values that may be far away; if the model is poor, `_far_off` takes over."""
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
@@ -182,20 +185,20 @@ def _from_afar(
     return _far_off(likelihood, best)
 
 
-def _far_off(likelihood: Likelihood, best: Found) -> Found:
+def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The best minimum of a model that does not fit: errors scaled to the residuals, and plates tried a wave thicker or
     thinner.
     """
     budget, starts = most_passes(likelihood.model) - best.steps, 1
 
-    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> Found:
+    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
         nonlocal budget
         maximum_steps = max(1, min(maximum_steps, budget))
         attempt = _search(likelihood, label, values, scale, best.expansion, maximum_steps=maximum_steps)
         budget -= attempt.steps
         return attempt
 
-    def rescaled(best: Found) -> Found:
+    def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
             scale = float(np.sqrt(best.expansion.misfit)) if best.expansion.misfit > FAR_OFF else 1.0
             if budget <= 0 or abs(scale / best.expansion.noise_scale - 1.0) < 0.1:

@@ -25,6 +25,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import (
     PointData,
@@ -36,7 +37,7 @@ from walop_jax.likelihood.engine import (
 )
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.layout import median_over_field
-from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
+from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
@@ -52,7 +53,7 @@ from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
 from walop_jax.model.sources import ExposureArrays, PointIllumination
 
-Change = Sequence[tuple[float, Sentence]]
+SumOfSentences = Sequence[tuple[float, Sentence]]
 """A sum of sentences with their coefficients."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
@@ -61,7 +62,9 @@ CAMERAS = ("counts", "opposite", *ADDED)
 GAPS_TOGETHER = 10  # thicknesses of air whose fringes are computed together, in one program for any number
 
 
-def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
+def columns(
+    likelihood: Likelihood, values: Vector, changes: Sequence[SumOfSentences]
+) -> Float[np.ndarray, "d a"]:
     """Derivatives of the used residuals (rows) with respect to the amplitudes of changes, at neutral.
 
     `values` are all parameters of the model. Raises `NoSlotError` for a sentence that has no slots.
@@ -225,7 +228,7 @@ class Columns:
         self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
         self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 
-    def has(self, change: Change) -> bool:
+    def has(self, change: SumOfSentences) -> bool:
         """True if a change is a sum of slots to first order."""
         try:
             self.terms_of(change)
@@ -233,7 +236,7 @@ class Columns:
             return False
         return True
 
-    def terms_of(self, change: Change) -> list[SlotTerm]:
+    def terms_of(self, change: SumOfSentences) -> list[SlotTerm]:
         """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
         terms = []
         for size, sentence in change:
@@ -326,18 +329,18 @@ class Columns:
             self._fringes[start, gaps] = joined
         return joined
 
-    def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
+    def of(self, changes: Sequence[SumOfSentences]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
         return self.rounded(changes, len(changes))[0]
 
     def rounded(
-        self, changes: Sequence[Change], exact: int
+        self, changes: Sequence[SumOfSentences], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
         return next(self.in_pieces(changes, exact, max(1, len(self.likelihood.used))))
 
     def in_pieces(
-        self, changes: Sequence[Change], exact: int, points: int
+        self, changes: Sequence[SumOfSentences], exact: int, points: int
     ) -> Iterator[tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]]:
         """The same for so many points at a time (whole blocks of `limits.RESPONSES_TOGETHER`), one after the other."""
         changed_terms = [self.terms_of(change) for change in changes]

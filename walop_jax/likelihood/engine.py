@@ -32,7 +32,7 @@ from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import Counts
-from walop_jax.model.parameters import Vector, values_of, with_values
+from walop_jax.model.parameters import ParameterVector, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
@@ -86,7 +86,7 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
 
 
 def rows_at(
-    values: Vector, template: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
+    values: ParameterVector, template: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
 ) -> Float[Array, "m b r 4"]:
     """Band rows (site, band, row, 4) at the sites of a point, for an instrument with `values` as its parameters.
 
@@ -187,7 +187,7 @@ def _linear_unit_counts(
     """Counts (e, k) of one point for light of unit flux, and their derivatives in its local quantities."""
     to_instrument = with_values(instrument)
 
-    def counts(values: Vector, local: Float[Array, "m k"]) -> Counts:
+    def counts(values: ParameterVector, local: Float[Array, "m k"]) -> Counts:
         rows = rows_at(values, instrument, plan, point, nodes)
         return unit_counts(to_instrument(values), plan, rows, local, point)
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
 from walop_jax.likelihood.flux import FluxGroups
@@ -34,9 +35,6 @@ from walop_jax.model.noise import NOISE
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import outgrown
 from walop_jax.model.specification import Model
-
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 
 
 class UsedData(NamedTuple):

@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from walop_jax.model import light
 from walop_jax.model.dependence import optical_reach
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Scalar, Vector, values_of, with_values
+from walop_jax.model.parameters import ParameterVector, Scalar, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import series_indices
 
@@ -79,7 +79,7 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
 
 
 def _slopes(
-    values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+    values: ParameterVector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
 ) -> tuple[Directions, light.Rows, Float[Array, "c b r 4"]]:
     """Band rows and their derivatives along `directions`."""
     along = directions(instrument, plan)
@@ -88,7 +88,9 @@ def _slopes(
 
 
 @jax.custom_jvp
-def band_rows(values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> light.Rows:
+def band_rows(
+    values: ParameterVector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> light.Rows:
     """Band rows (`light.band_rows`) at a field position (deg), of an instrument with these values of its parameters."""
     return light.band_rows(with_values(instrument)(values), plan, x, y)
 
@@ -128,7 +130,7 @@ def rows_and_slopes(
 
 @jax.custom_jvp
 def with_slopes(
-    values: Vector,
+    values: ParameterVector,
     rows: Float[Array, "*m b r 4"],
     slopes: Float[Array, "o *m b r 4"],
     index: Int[Array, " o"],

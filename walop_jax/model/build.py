@@ -34,7 +34,7 @@ SURE = 3.0  # standard deviations within which an instrument is built
 LARGEST_ANGLE = 4.0 * np.pi  # rad, of a number without a unit: two waves
 NANOMETRES = 3000.0  # above, wavelengths are taken for Angstrom
 
-Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
+ArmParts = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
 
 
@@ -56,7 +56,7 @@ def with_origins(text: str, elements: Sequence[Element]) -> str:
 
 def parts(
     description: Description, elements: Sequence[type[Element]] = ()
-) -> tuple[tuple[Element, ...], tuple[Arm, ...], Throughput, Cameras]:
+) -> tuple[tuple[Element, ...], tuple[ArmParts, ...], Throughput, Cameras]:
     """The parts of a described instrument, at the values of the description.
 
     An arm is its name, its elements and their order. `elements` are further kinds of elements for the description.
@@ -80,7 +80,7 @@ def parts(
     return common, arms, series, _cameras(description, arms)
 
 
-def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
+def _cameras(description: Description, arms: Sequence[ArmParts]) -> Cameras:
     names, fault = description.cameras, description.read.fault
     beams = []
     for arm, elements, path in arms:
@@ -110,7 +110,7 @@ class _Maker:
         where = line.removeprefix(made_by(kind))
         return f"It is {where}: give --elements FILE.py" if where else "One of your own: --elements FILE.py"
 
-    def arm(self, name: str, content: Any) -> Arm:
+    def arm(self, name: str, content: Any) -> ArmParts:
         place = f"arms.{self.read.name(name, 'arms')}"
         table = self.read.table(content, place)
         self.read.known(table, ("path", "elements"), place)

@@ -28,7 +28,7 @@ from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.sources import ExposureArrays, Scalar
 
-Places = Scalar | Float[Array, " e"]
+FieldCoordinate = Scalar | Float[Array, " e"]
 """Field coordinate (deg) of all exposures, or of each."""
 
 
@@ -108,7 +108,7 @@ class DetectorPart(Component):
 
     @abc.abstractmethod
     def reported(
-        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: FieldCoordinate, y: FieldCoordinate
     ) -> Float[Array, "e k"]:
         """Reported counts for arriving counts (electrons) at a field point (deg), or at one for each row (e)."""
 

@@ -33,7 +33,7 @@ PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
 
-Vector = Float[Array, " n"]
+ParameterVector = Float[Array, " n"]
 Scalar = Float[Array, ""]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
 """Valid names of parameters, in models and in files."""
@@ -283,7 +283,7 @@ def parameter_places(component: Component) -> tuple[tuple[int, int], ...]:
     return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
 
 
-def values_of(component: Component) -> Vector:
+def values_of(component: Component) -> ParameterVector:
     """The parameters of a component as one vector (n), in the order of `leaves`, each in its unit."""
     arrays = jax.tree_util.tree_leaves(component)
     chosen = [arrays[i] for i, _ in parameter_places(component)]
@@ -294,7 +294,7 @@ def values_of(component: Component) -> Vector:
     return jnp.concatenate([jnp.ravel(array) for array in chosen])
 
 
-def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyComponent]:
+def with_values(component: AnyComponent) -> Callable[[ParameterVector | np.ndarray], AnyComponent]:
     """A function that takes a vector (n) of parameters and returns the component with these in their places.
 
     A vector of numpy is cut by numpy, without a compiled program.
@@ -304,7 +304,7 @@ def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyC
     shapes = [np.shape(arrays[i]) for i in places]
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
 
-    def replaced(values: Vector | np.ndarray) -> AnyComponent:
+    def replaced(values: ParameterVector | np.ndarray) -> AnyComponent:
         filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
         for i, segment, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
             filled[i] = array(segment.reshape(shape))

@@ -23,7 +23,15 @@ from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures
-from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
+from walop_jax.model.quadrature import (
+    FAINT,
+    WAVES,
+    QuadratureRule,
+    band_rule,
+    moments,
+    rounded_up,
+    waves_over,
+)
 from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions, within
 from walop_jax.model.sources import ExposureArrays
 
@@ -180,7 +188,7 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
 
 
 @functools.lru_cache(maxsize=256)
-def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> Rule:
+def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> QuadratureRule:
     """Nodes of a band and their weights; cached, since the models of one set mostly share them."""
     path_difference, waves, faint = fringes
     return band_rule(

@@ -35,9 +35,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.mueller import Matrix2, computed_once, from_jones, inverse2, matrix2, product2, retarder
-
-Real = Float[Array, "..."]
+from walop_jax.model.mueller import (
+    Matrix2,
+    Real,
+    computed_once,
+    from_jones,
+    inverse2,
+    matrix2,
+    product2,
+    retarder,
+)
 
 
 class Plate(NamedTuple):

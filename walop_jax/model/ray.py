@@ -11,9 +11,8 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-Real = Float[Array, "..."]
+from walop_jax.model.mueller import Real
 
 CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD", "exptime": "EXPTIME"}
 """Conditions on which the optics may depend from exposure to exposure, and their columns of EXPOSURES: temperature in

@@ -47,7 +47,7 @@ from walop_jax.model.sources import MoonPatches, MoonSky, PointIllumination, Sta
 
 Slot = tuple[Any, ...]
 Moved = Callable[[Float[Array, " t"]], Instrument]
-Place = tuple[Scalar, Scalar]  # in the field (deg)
+FieldPoint = tuple[Scalar, Scalar]  # in the field (deg)
 Gaps = Float[Array, " g"]  # thicknesses of air (µm)
 OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
@@ -205,7 +205,7 @@ def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[
 
 
 def _vectors(
-    instrument: Instrument, at: Place, rows: Array, mean: Array, throughput: Array, shares: Array
+    instrument: Instrument, at: FieldPoint, rows: Array, mean: Array, throughput: Array, shares: Array
 ) -> light.Vectors:
     """Analysis vectors with shares of every camera in every other."""
     beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
@@ -214,7 +214,7 @@ def _vectors(
     return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
 
 
-def _banded(plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:
+def _banded(plan: Plan, at: FieldPoint, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:
     """Band sums at a field point, and slopes in the sizes of `moved`: of single plates, then of all together.
 
     Those of plates are multiplied by fringes of air of some thicknesses (µm).
@@ -225,7 +225,7 @@ def _banded(plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: G
 
 
 def _summed(
-    plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps, stretch: Scalar
+    plan: Plan, at: FieldPoint, moved: Moved, sizes: tuple[int, int], gaps: Gaps, stretch: Scalar
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
     conditions = plan.conditions

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.model.compiled import array
 from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
 
-Vector = Float[np.ndarray, " n"]
 THROUGHPUT = "throughput"
 """The part of an instrument that is a smooth map: single terms of it have no meaning."""
 GAUGE = "throughput.n0.p00"

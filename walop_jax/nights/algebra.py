@@ -27,13 +27,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.laws import Form, Law
 
-Laws = Sequence[Law | None]
+LawOfEach = Sequence[Law | None]
 OfUnits = Float[np.ndarray, "u n"]
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 
 LOCAL = ("night", "file", "walk")  # bases of laws that give a parameter values of its own in every cell
 
@@ -75,12 +74,12 @@ class Cell(NamedTuple):
 class Eliminated(NamedTuple):
     """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
-    block: Matrix
-    border: Matrix
-    before: Matrix
-    factor: tuple[Matrix, bool]  # of S_c
-    left: Matrix  # B'_c
-    right: Vector  # r'_c
+    block: AnyMatrix
+    border: AnyMatrix
+    before: AnyMatrix
+    factor: tuple[AnyMatrix, bool]  # of S_c
+    left: AnyMatrix  # B'_c
+    right: AnyVector  # r'_c
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +101,12 @@ class System:
 
     @classmethod
     def of(
-        cls, equations: Equations, laws: Laws, mean: Vector, width: Vector, means: Bool[np.ndarray, " n"]
+        cls,
+        equations: Equations,
+        laws: LawOfEach,
+        mean: AnyVector,
+        width: AnyVector,
+        means: Bool[np.ndarray, " n"],
     ) -> System:
         """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
         scale, middle = equations.scale, float(equations.mjd.mean())
@@ -150,7 +154,9 @@ class System:
                 yield 1.0 / (self.rates[i] ** 2 * (stop - start)), before, after
 
 
-def _cells(equations: Equations, laws: Laws, mean: Vector, precision: Vector, spread: Vector) -> list[Cell]:
+def _cells(
+    equations: Equations, laws: LawOfEach, mean: AnyVector, precision: AnyVector, spread: AnyVector
+) -> list[Cell]:
     """The cells in the order of time; the first state of a walk alone has the prior of its parameter."""
     local = {i: law for i, law in enumerate(laws) if law is not None and law.base in LOCAL}
     ends = np.ones(equations.night.max() + 1, bool)  # of a cell, with each night
@@ -184,7 +190,9 @@ class UndeterminedError(ValueError):
         self.parameter, self.unit = parameter, unit
 
 
-def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | None) -> tuple[Matrix, bool]:
+def _factored(
+    matrix: AnyMatrix, parameters: Int[np.ndarray, " k"], unit: int | None
+) -> tuple[AnyMatrix, bool]:
     """The Cholesky factor; `UndeterminedError` names the first parameter that has nothing left."""
     potrf: Any = linalg.lapack.dpotrf  # pyright: ignore[reportAttributeAccessIssue]
     factor, failed = potrf(matrix, lower=1, clean=1)
@@ -196,7 +204,7 @@ def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | Non
     return factor, True
 
 
-def cholesky_solve(factor: tuple[Matrix, Any], right: Any) -> Any:
+def cholesky_solve(factor: tuple[AnyMatrix, Any], right: Any) -> Any:
     """The inverse of a factored matrix (`scipy.linalg.cho_factor`) times right sides, of which there may be none."""
     return linalg.cho_solve(factor, right, check_finite=False) if right.size else right
 
@@ -243,7 +251,7 @@ def solve(system: System) -> Solution:
         right -= left.T @ gain[:, -1]
     factor = _factored(0.5 * (top + top.T), at, None)
     shared = cholesky_solve(factor, right)
-    values: list[Vector] = []
+    values: list[AnyVector] = []
     for c in reversed(range(len(done))):
         remainder = done[c].right - done[c].left @ shared
         if values:
@@ -252,7 +260,7 @@ def solve(system: System) -> Solution:
     return Solution(system, shared, tuple(values[::-1]), tuple(done), factor)
 
 
-def _block(system: System, cell: Cell) -> tuple[Matrix, Matrix, Vector]:
+def _block(system: System, cell: Cell) -> tuple[AnyMatrix, AnyMatrix, AnyVector]:
     """Own block, border and right side of a cell: priors and data, without the steps of walks."""
     e, p = system.equations, cell.parameter
     block = np.diag(cell.precision)
@@ -270,10 +278,10 @@ class Solution:
     """Unknowns that fit best, in units of `Equations.scale`, with their covariances."""
 
     system: System
-    shared: Vector
-    local: tuple[Vector, ...]
+    shared: AnyVector
+    local: tuple[AnyVector, ...]
     cells: tuple[Eliminated, ...]
-    factor: tuple[Matrix, bool]
+    factor: tuple[AnyMatrix, bool]
 
     @functools.cached_property
     def values(self) -> OfUnits:
@@ -309,14 +317,14 @@ class Solution:
         return [float(precision * step**2) for precision, step in pairs]
 
     @functools.cached_property
-    def covariance(self) -> Matrix:
+    def covariance(self) -> AnyMatrix:
         """Covariance of the global unknowns."""
         return cholesky_solve(self.factor, np.eye(len(self.shared)))
 
     @functools.cached_property
-    def smoothed(self) -> list[tuple[Matrix, Matrix]]:
+    def smoothed(self) -> list[tuple[AnyMatrix, AnyMatrix]]:
         """Of every cell the covariance of its unknowns, and that with the globals and the unknowns of the next cell."""
-        smoothed: list[tuple[Matrix, Matrix]] = []
+        smoothed: list[tuple[AnyMatrix, AnyMatrix]] = []
         beside = self.covariance  # of the globals and the next cell: none behind the last
         for c in reversed(range(len(self.cells))):
             entry = self.cells[c]
@@ -329,8 +337,8 @@ class Solution:
         return smoothed[::-1]
 
     def predict(
-        self, mjd: float, night: int | None = None, moved: Vector | float = 0.0
-    ) -> tuple[Vector, Matrix]:
+        self, mjd: float, night: int | None = None, moved: AnyVector | float = 0.0
+    ) -> tuple[AnyVector, AnyMatrix]:
         """All parameters at a time (MJD), from the origin, scaled, and their covariance.
 
         `night` is the number of the night that the time belongs to, None for one without equations; `moved` is added
@@ -377,7 +385,7 @@ class Solution:
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
-    def _elsewhere(self, i: int, at_time: Vector) -> tuple[float, float]:
+    def _elsewhere(self, i: int, at_time: AnyVector) -> tuple[float, float]:
         """A value of single nights or files where no data are, the globals having these functions, and its variance.
 
         Least squares of the values in a constant and the steps, bad nights and trends of the parameter: these may be
@@ -421,7 +429,7 @@ class Solution:
         return np.sqrt(np.clip(variance, 0.0, None))
 
 
-def _joined(covariance: Matrix, block: Matrix, others: Matrix) -> Matrix:
+def _joined(covariance: AnyMatrix, block: AnyMatrix, others: AnyMatrix) -> AnyMatrix:
     """A covariance with that of further unknowns, `block`; `others` is theirs with the first ones, and maybe more."""
     cross = others[:, : len(covariance)]
     return np.block([[covariance, cross.T], [cross, block]])

@@ -29,7 +29,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
-from walop_jax.nights.algebra import Laws, Solution, UndeterminedError
+from walop_jax.nights.algebra import LawOfEach, Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, solved, with_breaks
 from walop_jax.nights.together import EffectAmplitude, Together
 
@@ -108,7 +108,7 @@ class Tried(NamedTuple):
 
 
 def find(
-    data: Together, laws: Laws, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
+    data: Together, laws: LawOfEach, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...]]:
     """The breaks of a series, and the laws with them. Raises `UndeterminedError` where there is no solution.
 
@@ -135,7 +135,7 @@ def find(
     return tuple(sorted(breaks, key=lambda candidate: candidate.night)), with_breaks(data, laws, breaks)
 
 
-def _other_shapes(data: Together, laws: Laws) -> list[int]:
+def _other_shapes(data: Together, laws: LawOfEach) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
     shapes: dict[str, tuple[int, int] | None] = {}
     for p, law in zip(data.parameters, laws, strict=True):
@@ -229,7 +229,7 @@ def _nights_needed(
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
 
-def _held_out(data: Together, laws: Laws, entry: Break) -> float:
+def _held_out(data: Together, laws: LawOfEach, entry: Break) -> float:
     """Gain in χ² of every other night by the size that the others give; NaN where that cannot be asked."""
     i, halves = data.names.index(entry.name), []
     for odd in (0, 1):

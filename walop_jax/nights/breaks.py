@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.model.laws import Form, Law
-from walop_jax.nights.algebra import Laws, Solution, System, solve
+from walop_jax.nights.algebra import LawOfEach, Solution, System, solve
 from walop_jax.nights.together import Together
 
 
@@ -75,7 +75,7 @@ class Break:
         return (law or Law(())).adding("bad", self.before, self.after)
 
 
-def solved(data: Together, laws: Laws) -> Solution:
+def solved(data: Together, laws: LawOfEach) -> Solution:
     """The solution of nights under laws. Raises `UndeterminedError` where there is none."""
     return solve(System.of(data.equations, laws, data.mean, data.width, data.has_value))
 
@@ -98,7 +98,7 @@ def at_solution(data: Together, solution: Solution, entry: Break) -> Break:
     return dataclasses.replace(entry, size=float(scale * size), error=float(scale * error))
 
 
-def with_breaks(data: Together, laws: Laws, breaks: Sequence[Break]) -> tuple[Law | None, ...]:
+def with_breaks(data: Together, laws: LawOfEach, breaks: Sequence[Break]) -> tuple[Law | None, ...]:
     """Laws with breaks."""
     changed = list(laws)
     for entry in breaks:

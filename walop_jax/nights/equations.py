@@ -27,8 +27,9 @@ from walop_jax.fit.base_model import SKY_AND_STARS, gauges
 from walop_jax.fit.model_file import header_of
 from walop_jax.fit.search import moved_within
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.columns import Change, Columns
+from walop_jax.likelihood.columns import Columns, SumOfSentences
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -36,7 +37,6 @@ from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model
-from walop_jax.nights.algebra import Matrix, Vector
 from walop_jax.nights.together import EffectAmplitude, Night, source_of
 from walop_jax.sky.moon import local_sidereal_time
 from walop_jax.sky.nights import night_of
@@ -97,16 +97,16 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 
-Candidates = dict[str, tuple[Parameter, Change]]
+CandidateTable = dict[str, tuple[Parameter, SumOfSentences]]
 """Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
 
 def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
-) -> Candidates:
+) -> CandidateTable:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
     context = effect_context(model.template, exposures)
-    candidates: Candidates = {}
+    candidates: CandidateTable = {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
@@ -127,8 +127,8 @@ def candidates_of(
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, candidates: Candidates
-) -> tuple[float, Vector, Matrix]:
+    likelihood: Likelihood, values: AnyVector, candidates: CandidateTable
+) -> tuple[float, AnyVector, AnyMatrix]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     model = likelihood.model
     changes = [change for _, change in candidates.values()]
@@ -168,8 +168,8 @@ def model_hash(model: Model) -> str:
 def night_equations(
     calset: CalibrationSet,
     model: Model,
-    values: Vector | Mapping[str, float],
-    changes: Candidates | None = None,
+    values: AnyVector | Mapping[str, float],
+    changes: CandidateTable | None = None,
     *,
     number: int | None = None,
     own: bool = False,

@@ -27,7 +27,7 @@ from walop_jax.likelihood.workers import mapped
 from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
-    Candidates,
+    CandidateTable,
     candidates_of,
     model_hash,
     night_equations,
@@ -83,7 +83,7 @@ class Maker:
     folder: Path | None
     count: int = 1
     """Number of sets: programs for many are optimised."""
-    _candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
+    _candidates: dict[tuple[str, ...], CandidateTable] = dataclasses.field(default_factory=dict)
     _sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
 
     def make(self, task: Task) -> Made:
@@ -139,7 +139,7 @@ class Maker:
             self._sets[data.sha256] = read
         return read
 
-    def _candidates_of(self, model: Model, calset: CalibrationSet) -> Candidates:
+    def _candidates_of(self, model: Model, calset: CalibrationSet) -> CandidateTable:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self._candidates:

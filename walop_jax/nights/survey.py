@@ -35,11 +35,12 @@ from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.io.text import per_cent, value_and_error
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.model.laws import Law
-from walop_jax.nights.algebra import Matrix, Solution, Vector
+from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, among_globals
 from walop_jax.nights.changes import scan
 from walop_jax.nights.together import EffectAmplitude, Together
@@ -73,7 +74,7 @@ class Survey(Drawn):
     # ----------------------------------------------------------------------------------------------- how good
 
     @functools.cached_property
-    def excess(self) -> Vector:
+    def excess(self) -> AnyVector:
         """(χ² − dof)/√(2 dof) of every night: the distance of its data from the laws."""
         dof = np.array([night.dof for night in self.data.nights], float)
         return (self.solution.unit_chi2 - dof) / np.sqrt(2.0 * np.maximum(dof, 1.0))
@@ -226,7 +227,7 @@ class Survey(Drawn):
         same = np.flatnonzero(np.array(of_nights[::2]) == evening)
         return int(self.data.equations.night[same[0]]) if len(same) else None
 
-    def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
+    def values_at(self, mjd: float) -> tuple[AnyVector, AnyMatrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
         data, solution, scale = self.data, self.solution, self.data.equations.scale
         moved, scatter = np.zeros(len(solution.shared)), np.zeros(len(scale))

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.io.errors import fail
+from walop_jax.io.shapes import AnyVector
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.algebra import Equations, Vector
+from walop_jax.nights.algebra import Equations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,9 +104,9 @@ class Together:
     nights: tuple[Night, ...]
     parameters: tuple[Parameter, ...]
     candidates: int
-    origin: Vector
-    mean: Vector
-    width: Vector
+    origin: AnyVector
+    mean: AnyVector
+    width: AnyVector
     equations: Equations
 
     @property

@@ -33,7 +33,14 @@ from walop_jax.paper import polynomial
 from walop_jax.paper.polynomial import PaperCalibration, fit_polynomials, measured_qu
 from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science import star_errors
-from walop_jax.science.star_errors import MethodErrors, Truth, Vectors, determinant, statistics, transmitted
+from walop_jax.science.star_errors import (
+    MethodErrors,
+    RowVectors,
+    Truth,
+    determinant,
+    statistics,
+    transmitted,
+)
 
 LINES = 81  # wavelengths across the filter
 
@@ -79,7 +86,7 @@ def offsets(
     paper: PaperCalibration,
     measured: Float[np.ndarray, "p e 2"],
     states: Float[np.ndarray, "e 2"],
-    reference: Vectors,
+    reference: RowVectors,
     stars: Float[np.ndarray, "n 2"],
 ) -> Offsets:
     """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
@@ -247,11 +254,14 @@ def compare(
     teff = float(np.median(calset.exposures.teff[exposures]))
     analysis, setting = AnalysisVectors(calibration), Settings.default(1, filter_name)
 
-    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
+    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> RowVectors:
         return analysis.coloured(setting, x, y, np.full(len(x), teff))
 
     def errors_at(
-        x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], local: PaperCalibration, true: Vectors | None
+        x: Float[np.ndarray, " p"],
+        y: Float[np.ndarray, " p"],
+        local: PaperCalibration,
+        true: RowVectors | None,
     ) -> MethodErrors:
         joint = vectors(x, y)
         reference = joint if true is None else true
@@ -292,7 +302,7 @@ def _moon(
     calset: CalibrationSet,
     calibration: Calibration,
     paper: PaperCalibration,
-    reference: Vectors,
+    reference: RowVectors,
     stars: Float[np.ndarray, "n 2"],
 ) -> dict[str, Any] | None:
     """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""

@@ -55,7 +55,7 @@ GRID = 7
 DRAWS = 20
 NOT_CHOSEN = {condition: column for condition, column in CONDITIONS.items() if condition != "exptime"}
 """Conditions of an exposure that are as they come, and their columns."""
-Counts = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
+CountsAndSlopes = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
 """Counts of light of unit flux, and their derivatives to the free parameters."""
 _AT_ONCE = 36  # field points: arrays stay small
 _ROUNDING = 1e-10  # of the largest eigenvalue
@@ -132,7 +132,7 @@ def candidates(
         tell(f"expected counts of instrument {number} of {draws}")
         responses.append(_responses(likelihood, draw))
 
-    def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[Counts, ...]]:
+    def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[CountsAndSlopes, ...]]:
         """The light of some exposures of a choice, and their counts in every draw."""
         at = likelihood.used[:, rows.start]
         electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
@@ -225,7 +225,7 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
 _unit_at = compiled(jax.vmap(engine.unit_slopes, (None, None, 0)), kept_as="unit_counts")
 
 
-def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Counts:
+def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> CountsAndSlopes:
     """Counts for light of unit flux, and their derivatives to the free parameters."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
     batches = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
@@ -341,14 +341,14 @@ class Polarised(Family):
     """
 
     light: Illumination
-    counts: tuple[Counts, ...]
+    counts: tuple[CountsAndSlopes, ...]
     angles: int
     cost: Float[np.ndarray, " m"]
     kept: dict[int, Float[np.ndarray, "r f f"]] = dataclasses.field(default_factory=dict, compare=False)
 
     @classmethod
     def of(
-        cls, choice: CandidateExposure, light: Illumination, counts: tuple[Counts, ...], cost: float
+        cls, choice: CandidateExposure, light: Illumination, counts: tuple[CountsAndSlopes, ...], cost: float
     ) -> Polarised:
         """The candidates of a choice."""
         return cls(light, counts, len(choice.stops), np.full(len(choice.stops), float(cost)))

@@ -40,9 +40,9 @@ from jaxtyping import Float
 from scipy import linalg
 from scipy.optimize import minimize
 
-Weight = Float[np.ndarray, " s"]
+WeightVector = Float[np.ndarray, " s"]
 OfTargets = Float[np.ndarray, "r k"]
-Matrices = Float[np.ndarray, "r n n"]
+InformationMatrices = Float[np.ndarray, "r n n"]
 Key = tuple[int, int]
 """Number of the family of a candidate, and its own there."""
 Weights = Mapping[Key, float]
@@ -82,10 +82,10 @@ class Family(abc.ABC):
         """The matrices of some candidates."""
 
     @abc.abstractmethod
-    def gains(self, g: Matrices) -> Float[np.ndarray, " m"]:
+    def gains(self, g: InformationMatrices) -> Float[np.ndarray, " m"]:
         """Σ_r tr G_r M_r of every candidate."""
 
-    def between(self, g: Matrices) -> float:
+    def between(self, g: InformationMatrices) -> float:
         """The largest gain for its cost of those that lie between the candidates, where there are such."""
         return 0.0
 
@@ -108,7 +108,7 @@ class Listed(Family):
         """Matrices of the candidates with these numbers."""
         return self.matrices[:, list(numbers)]
 
-    def gains(self, g: Matrices) -> Float[np.ndarray, " m"]:
+    def gains(self, g: InformationMatrices) -> Float[np.ndarray, " m"]:
         """Σ_r tr G_r M_r of every candidate."""
         r, m = self.matrices.shape[:2]
         return np.einsum("rma,ra->m", self.matrices.reshape(r, m, -1), g.reshape(r, -1), optimize=True)
@@ -123,7 +123,7 @@ class Experiment:
     after the other, `targets` A (draw and block, target, own, q); `budget` is the cost that a plan may have.
     """
 
-    known: Matrices
+    known: InformationMatrices
     targets: Float[np.ndarray, "r k n q"]
     families: tuple[Family, ...]
     budget: float
@@ -146,14 +146,14 @@ class Experiment:
         turned = self.blocks.swapaxes(1, 2)[:, None] @ matrices[:, None] @ self.blocks[:, None]
         return turned.reshape(-1, *turned.shape[2:])
 
-    def total(self, weights: Weights) -> Matrices:
+    def total(self, weights: Weights) -> InformationMatrices:
         """Σ w M without the prior."""
         keys = list(weights)
         if not keys:
             return np.zeros_like(self.known)
         return np.einsum("s,rsab->rab", np.array([weights[key] for key in keys]), self.information(keys))
 
-    def of_families(self, g: Matrices) -> Float[np.ndarray, "d f f"]:
+    def of_families(self, g: InformationMatrices) -> Float[np.ndarray, "d f f"]:
         """G in the parameters of the families, so that Σ tr G M is the same."""
         if self.blocks is None:
             return g
@@ -279,27 +279,27 @@ class Some:
         some.costs = self.costs[list(which)]
         return some
 
-    def covariance(self, weight: Weight) -> Matrices:
+    def covariance(self, weight: WeightVector) -> InformationMatrices:
         """M(w)⁻¹ of every draw."""
         r, s, n, _ = self.matrices.shape
         information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
         return np.linalg.inv(0.5 * (information + np.swapaxes(information, 1, 2)))
 
-    def variances(self, weight: Weight) -> OfTargets:
+    def variances(self, weight: WeightVector) -> OfTargets:
         """φ of every target."""
         return self._by_target(self.wide * (self.covariance(weight) @ self.wide))
 
     def _by_target(self, products: Float[np.ndarray, "r n kq"]) -> OfTargets:
         return products.sum(axis=1).reshape(len(products), -1, self.columns).sum(axis=-1)
 
-    def value(self, weight: Weight) -> float:
+    def value(self, weight: WeightVector) -> float:
         """The criterion f(w); infinite where a target is not determined."""
         try:
             return float(self.experiment.largest(self.variances(weight)).mean())
         except np.linalg.LinAlgError:
             return np.inf
 
-    def near(self, *weights: Weight) -> Some:
+    def near(self, *weights: WeightVector) -> Some:
         """The same for the targets with the largest variances in some plans: whose value is at most that of all."""
         relative = np.maximum.reduce([self.experiment.relative(self.variances(weight)) for weight in weights])
         kept = np.argsort(-relative, axis=1)[:, : int((relative >= _NEAR).sum(axis=1).max())]
@@ -310,7 +310,7 @@ class Some:
         some.wide = columns.reshape(r, n, -1)
         return some
 
-    def power_mean(self, weight: Weight, power: float) -> tuple[float, Weight]:
+    def power_mean(self, weight: WeightVector, power: float) -> tuple[float, WeightVector]:
         """mean_r (Σ_k φ_rk^p)^(1/p) and its slope."""
         covariance = self.covariance(weight)
         y = covariance @ self.wide
@@ -326,7 +326,7 @@ class Some:
         slope = -np.einsum("rsa,ra->s", self.matrices.reshape(r, s, -1), g.reshape(r, -1), optimize=True)
         return float((top * total ** (1.0 / power)).mean()), slope
 
-    def solved(self, share: Weight, power: float, gap: float) -> Weight:
+    def solved(self, share: WeightVector, power: float, gap: float) -> WeightVector:
         """Shares of the budget with the least power mean; those given are where the search begins."""
         each, begin = self.experiment.budget / self.costs, [share]
         if power <= _POWERS[0]:
@@ -339,10 +339,10 @@ class Some:
                 return share
             begin.append(share)
 
-    def _solved(self, share: Weight, power: float, gap: float) -> Weight:
+    def _solved(self, share: WeightVector, power: float, gap: float) -> WeightVector:
         each = self.experiment.budget / self.costs
 
-        def function(free: Weight) -> tuple[float, Weight]:
+        def function(free: WeightVector) -> tuple[float, WeightVector]:
             total = free.sum()
             value, slope = self.power_mean(each * free / total, power)
             along = each * slope
@@ -416,7 +416,7 @@ def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | Non
 
 
 def lower_bound(
-    experiment: Experiment, covariance: Matrices, shares: OfTargets, *, finer: bool = False
+    experiment: Experiment, covariance: InformationMatrices, shares: OfTargets, *, finer: bool = False
 ) -> Bound:
     """The least criterion that any plan can have (see the module), over the grid or the finer one.
 
@@ -427,7 +427,7 @@ def lower_bound(
 
 
 def bounded(
-    problem: Experiment, covariance: Matrices, shares: OfTargets, finer: bool = False
+    problem: Experiment, covariance: InformationMatrices, shares: OfTargets, finer: bool = False
 ) -> tuple[Bound, list[Float[np.ndarray, " m"]]]:
     """The bound, and the gains d_i of all candidates that it is made of."""
     r, _, n, q = problem.targets.shape
@@ -446,7 +446,7 @@ def bounded(
     return Bound(here, float((g * problem.known).sum()), ratio), gains
 
 
-def multipliers(some: Some, weight: Weight, power: float) -> OfTargets:
+def multipliers(some: Some, weight: WeightVector, power: float) -> OfTargets:
     """π of the targets by the slope of a power mean."""
     relative = some.experiment.relative(some.variances(weight))
     return some.experiment.of_one(relative ** (power - 1.0))

@@ -25,7 +25,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
 from walop_jax.posterior.result import Convergence, Options, PosteriorSample
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 from walop_jax.posterior.target import Target, choose_sampled
 
 ENSEMBLES = 2  # the draws are shared out between, since files have chains
@@ -45,11 +45,11 @@ class Bootstrap(Sampler):
     name: ClassVar[str] = "bootstrap"
     repeats_the_fit: ClassVar[bool] = True
 
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """Raise TypeError: there is no density that it draws from."""
         self._without_chains()
 
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Raise TypeError."""
         self._without_chains()
 

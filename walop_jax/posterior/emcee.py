@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 
 MOVES = ("laplace", "de", "stretch")
 JUMPS = 0.1  # share of γ = 1 among differential evolution
@@ -44,7 +44,7 @@ class Emcee(Sampler):
     def __post_init__(self) -> None:
         mixture(self.moves)
 
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """Walkers drawn from the Laplace approximation, which is the unit normal in the sampled coordinates."""
         d = density.dimension
         count = self.walkers or max(LEAST_WALKERS, 2 * d)
@@ -58,7 +58,7 @@ class Emcee(Sampler):
             raise ValueError("the posterior is not finite around the fit")
         return {"positions": positions, "log_density": value, "random": random.get_state(legacy=True)}
 
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Go on for that many steps of all walkers."""
         import emcee
 

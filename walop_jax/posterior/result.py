@@ -28,6 +28,7 @@ from walop_jax.fit.verdict import STATED, Doubt, Quality, Verdict
 from walop_jax.io.code import versions_of
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior.draws import as_arviz, group_of_draws
@@ -190,8 +191,7 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
     return Convergence(names, steps, tau, history, ess, rhat, needed, tuple(reasons))
 
 
-Vector = Float[np.ndarray, " n"]
-Column = tuple[np.ndarray, str, str]  # values, unit, description
+DescribedColumn = tuple[np.ndarray, str, str]  # values, unit, description
 
 BURN_IN = 0.2  # share of the steps that is not used
 LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
@@ -364,7 +364,7 @@ class PosteriorSample(Drawn):
         i = self.names.index(name)
         return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
 
-    def intervals(self) -> dict[str, Column]:
+    def intervals(self) -> dict[str, DescribedColumn]:
         """Median, 68 and 95 % intervals of every coefficient that varies, as columns with unit and description.
 
         τ, effective samples and R-hat are NaN for coefficients that are not sampled but drawn from their conditional
@@ -374,7 +374,7 @@ class PosteriorSample(Drawn):
         values = self.draws.reshape(-1, len(self.names))[:, varies]
         names, units = [self.names[i] for i in varies], [self.units[i] for i in varies]
         deviation = np.sqrt(np.diag(self.covariance))[varies]
-        columns: dict[str, Column] = {
+        columns: dict[str, DescribedColumn] = {
             "NAME": (np.array(names), "", "coefficient"),
             "UNIT": (np.array(units), "", "unit of the numbers in this row"),
             "MEDIAN": (np.median(values, axis=0), "", "posterior median"),

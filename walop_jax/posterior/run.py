@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration, Matrix
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.clipped import read_clipped
@@ -24,12 +24,13 @@ from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT, SUMMARY
 from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.io.text import per_cent
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
 from walop_jax.model.effects.in_models import model_without
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 from walop_jax.posterior.draws import A_MEAN, read_groups
 
 SAME_FIT = 0.05  # standard errors

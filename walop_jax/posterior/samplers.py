@@ -33,7 +33,7 @@ SAMPLERS = {
 Positions = Float[np.ndarray, "n k"]
 Batch = Callable[[Positions], Float[np.ndarray, " n"]]
 
-State = Mapping[str, Any]  # all there is to an ensemble between two steps, by name
+EnsembleState = Mapping[str, Any]  # all there is to an ensemble between two steps, by name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +103,11 @@ class Sampler(abc.ABC):
     repeats_the_fit: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """Return an ensemble before its first step; `seed` as `numpy.random.default_rng` takes it."""
 
     @abc.abstractmethod
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Return the ensemble after `steps` more steps, and their results."""
 
 

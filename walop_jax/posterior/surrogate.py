@@ -39,10 +39,9 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model.compiled import compiled
 from walop_jax.model.noise import COMMON
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import Target, choose_sampled, ln_scale_unit
+from walop_jax.posterior.target import Draws, Target, choose_sampled, ln_scale_unit
 
-Matrix = Float[np.ndarray, "..."]
-Draws = Float[np.ndarray, "n k"]
+Stacked = Float[np.ndarray, "..."]
 
 OVERSAMPLING = 1.5  # design points per feature
 LEAST = 1.1  # pairs of points ±u per odd feature, and per even feature: a pair measures one of each
@@ -69,8 +68,8 @@ class Surrogate:
     across: Float[np.ndarray, "f s"]
     pairs: Int[np.ndarray, "p 2"]
     triples: Int[np.ndarray, "t 3"]
-    data: Matrix
-    prior: Matrix
+    data: Stacked
+    prior: Stacked
     linear: Float[np.ndarray, "s s"]
     share: Float[np.ndarray, " s"]
     slope: Float[np.ndarray, " k"]
@@ -132,7 +131,7 @@ class Surrogate:
         physical = self.centre[self.sampled] + z[..., :k] @ self.along[self.sampled].T
         return physical if self.scale is None else np.append(physical, self.scales(z)[..., None], axis=-1)
 
-    def _tilted(self, form: Matrix) -> Matrix:
+    def _tilted(self, form: Stacked) -> Stacked:
         """A quadratic form in h with the linear term of the determinant added."""
         k, tilted = len(self.slope), form.copy()
         tilted[0, 1 : 1 + k] += 0.5 * self.slope
@@ -207,13 +206,13 @@ def _inflated(
     return -0.5 * chi2 - (measured - 1.0) * ln_f
 
 
-def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
+def _axes(covariance: Stacked, scale: Float[np.ndarray, " k"]) -> Stacked:
     """A with A Aᵀ = covariance, columns along the principal axes in the units of `scale`."""
     value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
     return scale[:, None] * vector * np.sqrt(np.clip(value, value.max(initial=0.0) * 1e-15, None))
 
 
-def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
+def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Stacked, Stacked]:
     marginalised = np.setdiff1d(np.arange(len(target.free)), sampled)
     c, scale = target.covariance, target.scale
     axes = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
@@ -225,7 +224,9 @@ def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix
     return along, across
 
 
-def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
+def _gram(
+    target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None
+) -> Stacked:
     """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
     gram, batches = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
     for number, batch in enumerate(batches):
@@ -287,7 +288,7 @@ def build_surrogate(
     )  # fmt: skip
 
 
-def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) -> Matrix:
+def _prior_form(target: Target, along: Stacked, across: Stacked, n_features: int) -> Stacked:
     """Q of priors and loose pulls: they are linear in x, hence exact."""
     first = target.prior_rows(target.centre)
     rows = np.zeros((len(first), n_features))
@@ -298,7 +299,7 @@ def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) 
 
 
 def _determinant_slopes(
-    target: Target, along: Matrix, across: Matrix
+    target: Target, along: Stacked, across: Stacked
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
     """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
     total, twice = np.zeros(len(target.centre)), 2.0 * target.half_gradient(target.centre)
@@ -308,7 +309,7 @@ def _determinant_slopes(
     return total @ along, total @ across
 
 
-def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray, " s"]]:
+def _common_axes(data: Stacked, prior: Stacked) -> tuple[Stacked, Float[np.ndarray, " s"]]:
     """W with Wᵀ (D + P) W = 1 and Wᵀ D W diagonal."""
     if len(data) == 0:
         return np.zeros((0, 0)), np.zeros(0)

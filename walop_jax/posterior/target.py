@@ -26,7 +26,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
 from walop_jax.posterior.samplers import Density
 
-Vector = Float[np.ndarray, " f"]
+FreeValues = Float[np.ndarray, " f"]
 Draws = Float[np.ndarray, "n k"]
 LARGEST_SAMPLED = 20
 NEAR_LINEAR = ("throughput", "standard")
@@ -49,7 +49,7 @@ class Target:
         self.likelihood, self._near = result.likelihood, result.expansion
         self.model = result.model
         self.free = result.model.free
-        self.centre: Vector = result.values[self.free]
+        self.centre: FreeValues = result.values[self.free]
         self.covariance: Float[np.ndarray, "f f"] = result.covariance[np.ix_(self.free, self.free)]
         self.noise_scale, self._fitted = result.noise_scale, result.values
 
@@ -59,7 +59,7 @@ class Target:
         return tuple(self.model.names[i] for i in self.free)
 
     @property
-    def scale(self) -> Vector:
+    def scale(self) -> FreeValues:
         """A typical step of each free parameter (its prior width, or what preconditions the solver)."""
         return np.array([self.model.parameters[i].scale for i in self.free])
 
@@ -74,17 +74,17 @@ class Target:
         scale = self.scale
         return scale[:, None] * np.linalg.cholesky(self.covariance / np.outer(scale, scale))
 
-    def values(self, x: Vector) -> Float[np.ndarray, " n"]:
+    def values(self, x: FreeValues) -> Float[np.ndarray, " n"]:
         """All parameters, frozen and tied ones included."""
         return self.model.full(x, self._fitted)
 
-    def residuals(self, x: Vector, batch: engine.PointData) -> Float[np.ndarray, " d"]:
+    def residuals(self, x: FreeValues, batch: engine.PointData) -> Float[np.ndarray, " d"]:
         """Normalised residuals of one batch of the data, errors times `noise_scale`."""
         instrument = _instrument(self.model.template, jnp.asarray(self.values(x)))
         _, r = engine.residuals(instrument, self.likelihood.plan, batch)
         return np.asarray(r).ravel() / self.noise_scale
 
-    def prior_rows(self, x: Vector) -> Float[np.ndarray, " k"]:
+    def prior_rows(self, x: FreeValues) -> Float[np.ndarray, " k"]:
         """Normalised residuals of priors and loose pulls: linear in x."""
         return self.likelihood.priors.residuals(self.values(x))
 
@@ -104,15 +104,15 @@ class Target:
                 total[m] += np.sum((0.5 * (up + down) - at_centre) ** 2)
         return total
 
-    def half_gradient(self, x: Vector) -> Vector:
+    def half_gradient(self, x: FreeValues) -> FreeValues:
         """Half the gradient of the objective."""
         return self.likelihood.expand(self.values(x), self.noise_scale, self._near).gradient
 
-    def data(self, x: Vector) -> float:
+    def data(self, x: FreeValues) -> float:
         """χ² of the data, errors times `noise_scale`."""
         return sum(float(np.sum(self.residuals(x, batch) ** 2)) for batch in self.likelihood.points)
 
-    def objective(self, x: Vector) -> float:
+    def objective(self, x: FreeValues) -> float:
         """−2 ln posterior, up to a constant."""
         return self.data(x) + float(np.sum(self.prior_rows(x) ** 2))
 
@@ -161,7 +161,7 @@ class ExactPosterior:
         """Free parameters at sampled coordinates; nothing is left to be drawn."""
         return self.target.centre + z @ self.target.root.T
 
-    def moments(self, z: Draws) -> tuple[Vector, Float[np.ndarray, "f f"]]:
+    def moments(self, z: Draws) -> tuple[FreeValues, Float[np.ndarray, "f f"]]:
         """Mean and covariance of all free parameters over draws."""
         x = self.draw(z, np.random.default_rng(0))
         return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (x.shape[1],))

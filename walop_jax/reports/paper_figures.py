@@ -17,6 +17,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.errors import DataError
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import with_minus_sign
 from walop_jax.model.cameras import Cameras
 from walop_jax.model.instrument import Instrument
@@ -24,7 +25,7 @@ from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances
 from walop_jax.reports import style
-from walop_jax.reports.style import PAGE, AnyFigure, Canvas, Places, styled
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
 _PIXELS, _LINES = 31, 41
@@ -79,7 +80,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
 
 
 def _unwrapped_retardances(
-    instrument: Instrument, line: Float[np.ndarray, " w"], x: Places, y: Places
+    instrument: Instrument, line: Float[np.ndarray, " w"], x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "n p w"]:
     """Retardances (deg) of plates at places and wavelengths (µm), without jumps of 360°.
 

@@ -28,6 +28,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarF
 from scipy.spatial import KDTree
 
 from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import with_minus_sign
 from walop_jax.sky.nights import FIRST_DATE
 
@@ -57,7 +58,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
-Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
 AnyFigure = Any  # a figure on a `Canvas`, or the subfigure that took the room of axes
 
@@ -244,9 +244,9 @@ def pixel_map(
 def point_map(
     axis: Axes,
     title: str,
-    x: Places,
-    y: Places,
-    values: Places,
+    x: OfPoints,
+    y: OfPoints,
+    values: OfPoints,
     norm: Normalize,
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
@@ -271,14 +271,14 @@ def point_map(
     return tiles
 
 
-def error_map(axis: Axes, title: str, x: Places, y: Places, percent: Places, norm: Normalize) -> Any:
+def error_map(axis: Axes, title: str, x: OfPoints, y: OfPoints, percent: OfPoints, norm: Normalize) -> Any:
     """Tiles of an error of q, u or p at field points; crosses (NaN): a single exposure does not measure u there."""
     blind = np.isnan(percent)
     axis.plot(x[blind], y[blind], "x", color="0.5", ms=4, label="u not measured in one exposure")
     return point_map(axis, title, x, y, percent, norm, SEQUENTIAL)
 
 
-def nearest_apart(x: Places, y: Places) -> Places:
+def nearest_apart(x: OfPoints, y: OfPoints) -> OfPoints:
     """Distance of each point from the next at another place, the larger of those along X and Y.
 
     Squares with these sides do not overlap. Infinite for a point that is alone.
@@ -290,7 +290,7 @@ def nearest_apart(x: Places, y: Places) -> Places:
     return np.asarray(distance)[:, 1][number.ravel()]
 
 
-def _spacing(x: Places, y: Places) -> float:
+def _spacing(x: OfPoints, y: OfPoints) -> float:
     """Side of the tiles: the typical distance to the nearest neighbour."""
     few = slice(0, MOST_VECTOR)
     distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])

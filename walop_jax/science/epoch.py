@@ -52,8 +52,8 @@ from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
 from walop_jax.sky.position_angles import sky_to_instrument
 
-Vector = Float[np.ndarray, " k"]
-Matrix = Float[np.ndarray, "k k"]
+CommonVector = Float[np.ndarray, " k"]
+CommonMatrix = Float[np.ndarray, "k k"]
 
 CHANCE = 0.01
 COPIES = 1e-12  # chance of so small a χ² from which two sets are taken for one
@@ -329,7 +329,11 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
 
 
 def compared(
-    names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector, units: Sequence[str]
+    names: Sequence[str],
+    change: CommonVector,
+    covariance: CommonMatrix,
+    sigma: CommonVector,
+    units: Sequence[str],
 ) -> tuple[float, int, LargestChange]:
     """Δᵀ V⁻¹ Δ, the number of directions that were measured, and the largest change of a single parameter.
 

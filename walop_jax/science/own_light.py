@@ -34,6 +34,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize, special
 
+from walop_jax.io.shapes import OfStars
 from walop_jax.io.text import some, with_error
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import instrument_changes as alarms
@@ -58,8 +59,7 @@ _SURELY = 4.0  # of −2 ln L, two standard deviations
 _SLOPES = (1.5, 2.5, 3.5, 4.5)  # … and the exponents β of its variance that are tried
 _MOST_GROUPS = 20  # exposure groups with a mean of their own
 
-OfStars = Float[np.ndarray, " s"]
-Columns = Float[np.ndarray, "s 2 c"]
+ResponseColumns = Float[np.ndarray, "s 2 c"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class OwnLight:
     x: OfStars
     y: OfStars
     group: Int[np.ndarray, " s"]
-    questions: Columns
+    questions: ResponseColumns
     nuisances: Float[np.ndarray, "s 2 n"]
 
     @classmethod
@@ -167,7 +167,7 @@ class Unpolarised(NamedTuple):
 
     qu: Float[np.ndarray, "s 2"]
     noise: Float[np.ndarray, "s 2 2"]
-    shifts: Columns
+    shifts: ResponseColumns
 
 
 def unpolarised(
@@ -233,7 +233,7 @@ class _Fitted(NamedTuple):
     used: Bool[np.ndarray, " s"]
     qu: Float[np.ndarray, "s 2"]
     left: Float[np.ndarray, "s 2"]
-    questions: Columns
+    questions: ResponseColumns
     base: Float[np.ndarray, "s 2 m"]
     root: Float[np.ndarray, "m m"]
     scatter: float

@@ -20,10 +20,10 @@ from walop_jax.science.polarisation import polarisation
 
 FEW = 0.5  # of the rows
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
-Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
+StokesColumns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
-def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
+def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> StokesColumns:
     """Columns added to a catalogue (docs: files), of stars in all their rows; ValueError for an unknown `estimator`."""
     covariance = stars.covariance
     light = polarisation(stars.qu, covariance, estimator)

@@ -36,7 +36,7 @@ from walop_jax.model.specification import Model, make_model, series_indices
 from walop_jax.model.standards import standards_of
 from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
-Cube = Float[np.ndarray, "p e k"]
+ByPointExposureCamera = Float[np.ndarray, "p e k"]
 
 LEVEL = 0.5
 LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
@@ -150,10 +150,10 @@ def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple
 def _scattered(
     plan: ObservingPlan,
     truth: Instrument,
-    expected: Cube,
-    counts: Callable[[Instrument], Cube],
+    expected: ByPointExposureCamera,
+    counts: Callable[[Instrument], ByPointExposureCamera],
     rng: np.random.Generator,
-) -> Cube:
+) -> ByPointExposureCamera:
     """Counts that the stars of a field have beyond those of their mean q, u: light is linear in them."""
     _, source = plan.layout()
     measured, scatter = source[:, :, None] == plan.standards, np.zeros_like(expected)
@@ -332,7 +332,9 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 
-def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
+def _expected(
+    blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]
+) -> ByPointExposureCamera:
     """Expected counts (electron) of every (point, exposure), the response of the detectors included."""
     likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
     unit = np.concatenate(

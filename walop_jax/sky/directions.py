@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Degrees = Float[np.ndarray, " n"]
+from walop_jax.io.shapes import Vector
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,17 +45,17 @@ class Pointing:
         plane.wcs.cd = [[sin, cos], [cos, -sin]]
         return plane
 
-    def field_of(self, ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees]:
+    def field_of(self, ra: Vector, dec: Vector) -> tuple[Vector, Vector]:
         """X and Y (deg) of stars in the hemisphere about the field centre."""
         x, y = self._plane().wcs_world2pix(ra, dec, 1)
         return np.asarray(x, float), np.asarray(y, float)
 
-    def sky_of(self, x: Degrees, y: Degrees) -> tuple[Degrees, Degrees]:
+    def sky_of(self, x: Vector, y: Vector) -> tuple[Vector, Vector]:
         """Right ascension and declination (deg) of field points."""
         ra, dec = self._plane().wcs_pix2world(x, y, 1)
         return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
 
-    def rotator_at(self, ra: Degrees, dec: Degrees) -> Degrees:
+    def rotator_at(self, ra: Vector, dec: Vector) -> Vector:
         """Position angle of +X (deg) at stars, from their own north."""
         centre, stars = _directions(self.ra, self.dec), _directions(ra, dec)
         outward = np.asarray(centre.position_angle(stars).deg)
@@ -70,7 +70,7 @@ def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.nda
     return np.asarray(np.rad2deg(angular_separation(*map(np.deg2rad, (ra, dec, other_ra, other_dec)))))
 
 
-def galactic(ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees, Degrees]:
+def galactic(ra: Vector, dec: Vector) -> tuple[Vector, Vector, Vector]:
     """Galactic longitude and latitude of directions, and the position angle of Galactic north there (deg).
 
     A position angle from Galactic north is that from equatorial north less the last one.
@@ -85,7 +85,7 @@ def galactic(ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees, Degrees]:
     return longitude, latitude, north
 
 
-def designations(ra: Degrees, dec: Degrees) -> np.ndarray:
+def designations(ra: Vector, dec: Vector) -> np.ndarray:
     """Names of directions (deg) by their coordinates, Jhhmmss.ss+ddmmss.s, cut off as the IAU asks."""
     seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int) % 8640000  # hundredths
     arcsec = np.floor(np.abs(dec) * 36000.0 + 1e-6).astype(int)  # tenths
@@ -99,7 +99,7 @@ def designations(ra: Degrees, dec: Degrees) -> np.ndarray:
     )
 
 
-def same_stars(ra: Degrees, dec: Degrees, tolerance: float) -> Int[np.ndarray, " n"]:
+def same_stars(ra: Vector, dec: Vector, tolerance: float) -> Int[np.ndarray, " n"]:
     """The number of the star of every position (deg): chains of those within a tolerance (arcsec) are one star."""
     stars = _directions(ra, dec)
     first, second, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
@@ -199,5 +199,5 @@ def mutual(
     return np.asarray(ambiguous), pairs, np.asarray(nearest)[pairs]
 
 
-def _directions(ra: float | Degrees, dec: float | Degrees) -> Any:
+def _directions(ra: float | Vector, dec: float | Vector) -> Any:
     return SkyCoord(ra, dec, unit="deg", frame="icrs")

@@ -19,7 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Places, Transmission
+from walop_jax.model.cameras import (
+    DetectorPart,
+    ExposurePart,
+    FieldCoordinate,
+    GhostPart,
+    Mixing,
+    Transmission,
+)
 from walop_jax.model.effects.change import (
     KINDS,
     OPPOSITE,
@@ -40,7 +47,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
 from walop_jax.model.sources import ExposureArrays
 
-Weights = tuple[float, ...]
+CameraWeights = tuple[float, ...]
 REFERENCE_COUNTS = 1e6  # electron
 
 
@@ -49,7 +56,7 @@ class _Cameras(Component):
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
-    cameras: tuple[Weights, ...] = eqx.field(static=True)
+    cameras: tuple[CameraWeights, ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, instrument: Instrument, terms: Sequence[Term], **fixed: Any) -> _Cameras:
@@ -134,7 +141,7 @@ class OfDetectors(_Cameras, DetectorPart):
     stage: str = eqx.field(static=True, default="reported")
 
     def reported(
-        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: FieldCoordinate, y: FieldCoordinate
     ) -> Float[Array, "e k"]:
         """Counts with the additions."""
         added, total = ADDED[self.stage](counts, exposures), counts
@@ -240,7 +247,7 @@ KINDS |= {
 }
 
 
-def cameras_of(instrument: Instrument, place: str) -> Weights:
+def cameras_of(instrument: Instrument, place: str) -> CameraWeights:
     """1 for the cameras of a place: a camera, or an arm. Raises ValueError for any other name."""
     names = instrument.cameras.names
     for arm in instrument.arms:

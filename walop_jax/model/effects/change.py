@@ -38,7 +38,7 @@ from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
-Given = str | Callable[[Any], Any]
+FactorLike = str | Callable[[Any], Any]
 """A factor: a text, or a function of the quantities of factors."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order", "night hours")
@@ -101,7 +101,7 @@ class SlotTerm(NamedTuple):
 
     slot: tuple[Any, ...]
     size: float
-    factors: tuple[Given, ...]
+    factors: tuple[FactorLike, ...]
 
 
 SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
@@ -147,7 +147,7 @@ class Change:
     kind: str
     relation: str
     place: str
-    factors: tuple[Given, ...] = ()
+    factors: tuple[FactorLike, ...] = ()
     origin: str = ""
     units: Units = OF_WALOP
 
@@ -316,7 +316,7 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     return instrument
 
 
-def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
+def product(factors: Iterable[FactorLike], at: Any, units: Units) -> Any:
     """Product of factors, 1 without any."""
     values = (factor(item).value(at, units) if isinstance(item, str) else item(at) for item in factors)
     return functools.reduce(operator.mul, values, 1.0)

@@ -26,8 +26,9 @@ from jaxtyping import Array, Float
 from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.mueller import Real
 from walop_jax.model.parameters import Scalar, number
-from walop_jax.model.ray import Ray, Real
+from walop_jax.model.ray import Ray
 
 
 def pupil_direction(

@@ -29,8 +29,9 @@ from walop_jax.model.compiled import need_float64
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
+from walop_jax.model.mueller import Real
 from walop_jax.model.parameters import Component, Parameter, Scalar, number
-from walop_jax.model.ray import Conditions, Ray, Real
+from walop_jax.model.ray import Conditions, Ray
 
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
