@@ -72,7 +72,9 @@ def colour_weights(teff: OfPoints, count: int) -> Float[np.ndarray, "p c"]:
 
 
 class Local(NamedTuple):
-    """Derivatives of the vectors at a field point: to the plain parameters, to the throughputs of the cameras."""
+    """Derivatives of the vectors at a field point: in the plain parameters, and in the throughputs of the cameras
+    there.
+    """
 
     plain: Float[np.ndarray, "p k 3 o"]
     throughput: Float[np.ndarray, "p k 3 k"]
@@ -81,8 +83,11 @@ class Local(NamedTuple):
 class AnalysisVectors:
     """The analysis vectors of a calibration, ready to be asked for at many field points.
 
-    `parameters` are the positions, in the calibration's list, of the parameters that the vectors depend on;
-    `root` is a square root of their covariance, C = root rootᵀ. Positions reach to ±`half_width` (deg).
+    `parameters` are the positions, in the calibration's list, of the parameters that the vectors depend on; `root` is a
+    square root of their covariance, C = root rootᵀ. Field positions reach to ±`half_width` (deg).
+
+    Example: `AnalysisVectors(calibration).coloured(setting, x, y, teff)` are the responses (point, camera, 3) of all
+    cameras to I, q and u of stars at x, y.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -114,7 +119,9 @@ class AnalysisVectors:
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
-        """The settings, equal where these optics are: fewer distinct ones."""
+        """The settings with numbers that make no difference to these optics made equal, so that fewer distinct ones are
+        left.
+        """
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
         patched = self.instrument.patched()
         return dataclasses.replace(
@@ -150,7 +157,7 @@ class AnalysisVectors:
 
     @functools.cached_property
     def acting(self) -> Mapping[int, Effect]:
-        """Mistakes that could hide and act on starlight, by number: effects at their sizes."""
+        """Undetected errors that act on starlight itself, by number: effects at their sizes."""
         return acting_effects(self.calibration)
 
     @functools.cached_property
@@ -178,7 +185,9 @@ class AnalysisVectors:
         x: OfPoints,
         y: OfPoints,
     ) -> Float[np.ndarray, "p 2 n"]:
-        """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
+        """Derivatives in `parameters` (p, 2, n): those in the local throughputs are spread over the terms of the
+        series.
+        """
         spread = through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
         return np.concatenate([plain, spread], axis=-1)
 

@@ -63,10 +63,10 @@ def residual_names(arms: int) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class MatrixMaps:
-    """The elements of the instrument matrix over the field, for a look: order of `matrix_names`, three per arm.
+    """Maps of the elements of the instrument matrix over the field, for display; in the order of `matrix_names`.
 
-    For the filter named, a flat photon spectrum, and the moving elements at `positions` (deg by column prefix; those
-    not there are out). Raises ValueError for another number of planes.
+    They are for the filter named, a flat photon spectrum, and the moving elements at `positions` (deg, by the prefix of
+    their columns; an element without a position is out of the beam). Raises ValueError for another number of planes.
     """
 
     grid: Grid
@@ -86,7 +86,7 @@ class MatrixMaps:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the elements."""
+        """Names of the elements: M21, M22, …"""
         return matrix_names(self.arms)
 
 
@@ -94,9 +94,10 @@ class MatrixMaps:
 class ResidualMap:
     """Residuals of the smooth model in cells of the field: planes in the order of `residual_names`.
 
-    To be added to the matrix (throughput of an arm: relative); NaN where a cell has too few data. `chi2` is that of the
-    residuals before the correction, per degree of freedom. Through `filter`, with the moving elements at `positions`
-    (deg by column prefix; those not there are out). Raises ValueError for another number of planes.
+    They are to be added to the matrix elements (the throughput of an arm is a relative correction); NaN where a cell
+    has too few data. `chi2` is χ² per degree of freedom of the residuals before the correction. They are for `filter`,
+    with the moving elements at `positions` (deg, by the prefix of their columns; an element without a position is out
+    of the beam). Raises ValueError for another number of planes.
     """
 
     grid: Grid
@@ -122,7 +123,9 @@ class ResidualMap:
         return residual_names(self.arms)
 
     def excess(self) -> dict[str, float]:
-        """Rms over the field of every quantity beyond its standard errors; negative if below, as chance has it."""
+        """Rms over the field of every quantity beyond its standard errors; negative where chance makes it smaller than
+        those.
+        """
         rms = {}
         for name, value, error in zip(self.names, self.values, self.errors, strict=True):
             finite = np.isfinite(value)
@@ -156,10 +159,11 @@ def _vectors_at(
 def _slopes_at(
     instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
-    """Analysis vectors for light from the sky, and their derivatives.
+    """Analysis vectors (p, b, k, 3) for light from the sky, and their derivatives (p, d, b, k, 3).
 
-    At rows of x, y (deg), and of colour temperature (0: flat), temperature and hour angle if these are not those of the
-    plan. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the place.
+    `columns` are x and y (deg) and, if they are not those of the plan, colour temperature (K, 0: flat), temperature and
+    hour angle. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the field
+    point.
     """
 
     def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
@@ -196,7 +200,7 @@ sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 def vector_slopes(
     instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "p d b k 3"]:
-    """Derivatives of `sky_vectors` in all parameters but the terms of the throughput, then in the throughputs there."""
+    """Derivatives (p, d, b, k, 3) of `sky_vectors`: in all parameters but the series, then in the throughputs there."""
     return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
 
@@ -322,11 +326,11 @@ def slopes_over_field(
     counts: Sequence[int],
     tolerance: float,
 ) -> tuple[Matrices, Slopes]:
-    """`matrix_slopes` at many positions, interpolated where the optics are smooth.
+    """The matrices and derivatives of `matrix_slopes` at many positions, interpolated where the optics are smooth.
 
-    `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
-    that is checked (`field_table.held_out`). No table is tried that has more nodes than half of the positions, nor
-    beside local features, which none follows: it would cost more than the positions themselves.
+    Numbers of nodes per side (`counts`) are tried in turn, until standard errors are right to `tolerance` (relative)
+    wherever that is checked (`field_table.held_out`). No table is tried that has more nodes than half of the positions,
+    as it would cost more than the positions themselves, and none beside local features, which no table follows.
     """
     exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
@@ -344,10 +348,10 @@ def slopes_over_field(
 
 
 def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
-    """Contribution of the structure of field points to the covariance of the matrix at a place.
+    """Covariance (p, m, m) of the matrix elements by structure of the field that is finer than the model.
 
-    Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their
-    responses to q and u the last two by half of their difference.
+    Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their responses
+    to q and u the last two by half of their difference.
     """
     size = values.shape[1]
     added = np.zeros((len(values), size, size))
@@ -368,7 +372,10 @@ def effect_slopes(
     y: OfPoints,
     effects: tuple[Effect, ...],
 ) -> Float[np.ndarray, "p a 3 e"]:
-    """Derivatives of the matrix to the amplitudes of neutral effects, in order; parts outside the matrix have none."""
+    """Derivatives (point, arm, element, amplitude) of the matrix in the amplitudes of neutral effects, in their order.
+
+    They are 0 for parts of an effect that do not act on the matrix.
+    """
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
     neutral, put = with_amplitudes(instrument, effects)
@@ -383,7 +390,7 @@ def effect_slopes(
 
 
 def first_setting(calset: CalibrationSet, instrument: Instrument, exposure: int = 0) -> Settings:
-    """Filter and positions of an exposure of a set, its first, all else as by default."""
+    """The setting of one exposure of a set, by default the first: its filter and positions; all else as by default."""
     first = Settings.of(calset.exposures[exposure : exposure + 1], instrument.patched().moving())
     return Settings.default(1, str(first.filter[0])).at(**first.positions)
 

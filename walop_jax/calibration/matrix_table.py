@@ -12,9 +12,9 @@ from walop_jax.io.text import per_cent, with_error, with_minus_sign
 
 
 class MatrixTable(Table):
-    """Field points with the instrument matrix; a few of them are printed as elements with their errors.
+    """Field points with the instrument matrix; a few rows are printed as elements with their errors.
 
-    `meanings` are those of the bits of FLAG.
+    `meanings` are the meanings of the bits of FLAG.
     """
 
     FEW = 4

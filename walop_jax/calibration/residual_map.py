@@ -92,7 +92,7 @@ def _sums(*given: Any) -> Float[Array, "p n"]:
 
 
 def cells_for(points: int, used_data: UsedData, points_per_cell: int = POINTS_PER_CELL) -> Grid:
-    """A grid of square-ish cells over the used part of the field: so many points in each, or more."""
+    """A grid of nearly square cells over the used part of the field, with at least `points_per_cell` points in each."""
     low_x, high_x, low_y, high_y = used_data.field
     side = int(np.clip(np.sqrt(points / points_per_cell), 1, MOST_CELLS))
     width, height = (high_x - low_x) / side or 1.0, (high_y - low_y) / side or 1.0
@@ -110,7 +110,9 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
 def _main_setting(
     settings: Settings, through: Bool[np.ndarray, " e"]
 ) -> tuple[Settings, Bool[np.ndarray, " e"]]:
-    """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
+    """The setting that most exposures `through` the polariser have, if possible with all other elements out; and its
+    exposures.
+    """
 
     def preferred(layout: tuple[Settings, Int[np.ndarray, " r"]]) -> tuple[object, ...]:
         setting, rows = layout
@@ -130,12 +132,12 @@ def residual_map(result: FitResult) -> ResidualMap:
 
 
 def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | None = None) -> ResidualMap:
-    """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
+    """The map of `residual_map` at any full vector of values (n); `near` is an expansion at similar values."""
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
     setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
-    # The points of whole frames stand for many pixels: those of one block of them are a cell.
+    # The points of whole frames stand for many pixels: the points of one block of pixels are a cell.
     points_per_cell = ORDER**2 if likelihood.calset.fine is not None else POINTS_PER_CELL
     used_data = likelihood.used_data if near is None else near.used_data
     grid = cells_for(likelihood.layout.points, used_data, points_per_cell)

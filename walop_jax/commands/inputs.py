@@ -176,7 +176,7 @@ def shown_with_accuracy(result: FitResult, accuracy: FieldAccuracy | None) -> Di
     verdict = verdict_of_fit(result, accuracy)
     if accuracy is None:
         return verdict.on_top_of(shown)
-    # The accuracy names the mistakes that could hide with their effect on stars.
+    # The accuracy names the systematic errors that could hide, with their effect on stars.
     hidden = "" if result.hidden is None else result.hidden.in_words()
     notes = tuple(note for note in shown.notes if note != hidden)
     shown = dataclasses.replace(

@@ -49,14 +49,14 @@ those of a fit to all pixels."""
 ORDER = 4
 """Points along a side of a block."""
 BRIGHT = 20.0
-"""Standard errors of the light of a pixel, or of a cell, above which shares of it are taken."""
+"""Standard errors of the light of a pixel, or of a cell, above which fractions of it are taken."""
 MAP = 16
 """Parts of a block, along a side, in which structure is measured."""
 
 _TOGETHER = 1 << 15  # pixels of a camera: their numbers stay in the cache of a processor
 _HUGE = 10.0  # times the median error in its block row: a mark of a bad pixel, and no error
 _WHOLE = 0.2  # smallest eigenvalue of the normal matrix, 1 with all pixels, of a block with all of its points
-_SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a block hold
+_SOUND = 0.05  # the same, for its fraction of pixels, of a surface that parts of a block hold
 _FEW = 0.05  # of the patches of a row of blocks: with more of them spots are no spots, and stay
 _ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it are left out there
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
@@ -299,7 +299,7 @@ class _Binning:
         sigma: Float[np.ndarray, "k y x"],
         used: Bool[np.ndarray, "y x"],
     ) -> Float[np.ndarray, "y x"]:
-        """The light of every used pixel: the sum of its cameras, or 1 in blocks where shares of that say nothing."""
+        """The light of every used pixel: the sum of its cameras, or 1 in blocks where fractions of that say nothing."""
         if self.known[exposure] or self.single:
             return np.ones(used.shape)
         total = np.where(used, counts.sum(axis=0, dtype=float), 0.0)
@@ -420,7 +420,7 @@ class _Binning:
             least = np.linalg.eigvalsh(normal[:, terms[:, None], terms])[:, 0]
             if len(terms) <= parts and least.max() >= _SOUND * normal[:, 0, 0].max():
                 return terms, least
-        # The first polynomial is constant: its term is the share of the pixels that are used.
+        # The first polynomial is constant: its term is the fraction of the pixels that are used.
         return index[0, :1], normal[:, 0, 0]
 
     # --------------------------------------------------------------------------------------------------- structure

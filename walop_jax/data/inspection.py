@@ -50,7 +50,7 @@ class Finding:
 class Group:
     """Exposures that share kind, filter, calibration plate (text) and colour temperature (text).
 
-    `teff` is "star" for standards, which have their own; `used` is the share of the points with used data.
+    `teff` is "star" for standards, which have their own; `used` is the fraction of the points with used data.
     """
 
     kind: str

@@ -7,8 +7,8 @@ Surface     The field is cut into rectangles. To the cells of a rectangle a poly
             is fitted for each exposure and camera, and kept as its values at q × q points: the zeros of the polynomials
             of degree q that are orthogonal over the cells, weighted by what these know. As in `cells` values there have
             independent errors, and the next polynomial, left out, is zero there.
-Light       Fitted are shares of the light of a cell, where fluxes are free, and their product with the surface of the
-            light is kept (`cells`).
+Light       Fitted are fractions of the light of a cell, where fluxes are free, and their product with the surface of
+            the light is kept (`cells`).
 Weights     w of a cell is the mean of L²/σ² over exposures and cameras, alike for all of them, as a product of one
             number for each column and one for each row. Errors are those of σ, propagated.
 Gaps        Cells that an exposure lacks are left out of its fit. A rectangle whose cells are no raster, at the edge of

@@ -96,9 +96,9 @@ def _usual(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class StatedErrors:
-    """Standard errors of the numbers that a set states, each of a mistake that all of them have in common.
+    """Standard errors of the numbers that a set states, each of a systematic error that all of them have in common.
 
-    They say which mistakes to reckon with where the data would not show them. The search for a mistake is not limited
+    They say which errors to reckon with where the data would not show them. The search for an error is not limited
     by them: one that is far larger is found all the same. Units and usual sizes are those of `ERROR_WORDS`: what is
     left of an astrometric solution, of the clock of a computer, of a measured filter curve. 0: known exactly.
 

@@ -64,7 +64,7 @@ def builtin_filter(name: str) -> FilterCurve:
     """Return a built-in filter curve by name; wavelength in µm.
 
     `SDSS-r` is the r curve of the SDSS camera as measured by Doi et al. 2010, AJ 139, 1628, Table 4, for an
-    airmass of 1.3. The curve counts photons: it is the share of the photons at each wavelength that is detected.
+    airmass of 1.3. The curve counts photons: it is the fraction of the photons at each wavelength that is detected.
 
     `MONO-6500` is light of 6500 Å alone, and so on. Raises `DataError` with the nearest names if there is no such
     filter.

@@ -20,7 +20,7 @@ NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
 SPOILT = 0.2
-"""Above this share of unusable rows the set is refused, not masked."""
+"""Above this fraction of unusable rows the set is refused, not masked."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

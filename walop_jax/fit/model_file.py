@@ -193,7 +193,7 @@ def model_without_data(
 
     def build(header: ModelTable) -> Model:
         nominal = adapted(design, standards=standards, **header.of_instrument())
-        model = make_model(nominal.name, nominal, frozen=(GAUGE,))
+        model = make_model(nominal.name, nominal, fixed=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
         facts = {"sources": nominal.standard.names, "cameras": nominal.cameras.names, "units": nominal.units}
         return with_effects_of(model, header, context or Context(**facts))

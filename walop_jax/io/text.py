@@ -105,7 +105,7 @@ def beside(value: float, limit: float, form: str = "#.{}g") -> tuple[str, str]:
 
 
 NOISE = 1e-8
-"""Share below which an effect on q, u or p is rounding noise of float64 optics, and no result."""
+"""Fraction below which an effect on q, u or p is rounding noise of float64 optics, and no result."""
 
 
 def per_cent(share: float | None) -> str:

@@ -16,7 +16,7 @@ RANK_TOLERANCE = 1e-8
 def whitening(matrix: AnyMatrix, least: float = RANK_TOLERANCE) -> AnyMatrix:
     """W with Wᵀ G W = 1 on the range of a symmetric matrix G, so that W Wᵀ is its inverse there.
 
-    With a diagonal of ones, directions of which the matrix has less than the share `least` of its largest eigenvalue
+    With a diagonal of ones, directions of which the matrix has less than the fraction `least` of its largest eigenvalue
     are left out, and rows of zeros with them.
     """
     norm = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
@@ -55,7 +55,7 @@ def square_root(covariance: Float[np.ndarray, "*r n n"]) -> Float[np.ndarray, "*
 
 
 def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
-    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
+    """B with B Bᵀ the matrices, without eigenvalues below a fraction `least` of the largest (none: as many columns)."""
     root = square_root(matrices)
     value = np.sum(root**2, axis=1)
     return root[:, :, -int((value > least * value[:, -1:]).sum(axis=1).max()) :]

@@ -1,7 +1,7 @@
 """Other descriptions of an instrument: elements in another order or turned, left out, of another published dispersion.
 
 A change is a sentence and a function of the instrument. The sentences name places as `Instrument.changed` does. The
-list holds mistakes in the description, or in the assembly, of an instrument: none of them has a size. Changes without
+list holds errors in the description, or in the assembly, of an instrument: none of them has a size. Changes without
 effect on the light (of plates that commute) are listed too: the data decide.
 """
 

@@ -207,7 +207,7 @@ def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[
 def _vectors(
     instrument: Instrument, at: FieldPoint, rows: Array, mean: Array, throughput: Array, shares: Array
 ) -> light.Vectors:
-    """Analysis vectors with shares of every camera in every other."""
+    """Analysis vectors with fractions of every camera in every other."""
     beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
     pairs = tuple(np.ndindex(len(throughput), len(throughput)))
     vectors = light.behind_throughput(instrument, beams, throughput, *at)

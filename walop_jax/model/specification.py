@@ -216,20 +216,20 @@ def make_model(
     instrument: Instrument,
     *,
     priors: Mapping[str, tuple[float, float]] | None = None,
-    frozen: Sequence[str] = (),
+    fixed: Sequence[str] = (),
 ) -> Model:
     """The model of an instrument at its nominal values with the priors of its declarations.
 
-    `priors` adds priors by name (catalogue errors of standards), `frozen` names fixed parameters.
+    `priors` adds priors by name (catalogue errors of standards), `fixed` names the parameters that are not fitted.
     """
     priors = dict(priors or {})
     parameters = [
-        dataclasses.replace(p.at(value, priors.pop(p.name, None)), free=p.name not in frozen)
+        dataclasses.replace(p.at(value, priors.pop(p.name, None)), free=p.name not in fixed)
         for p, value in zip(leaves(instrument), np.asarray(values_of(instrument)).tolist(), strict=True)
     ]
     names = [p.name for p in parameters]
     for master in [p.tie for p in parameters if p.tie is not None and p.tie not in names]:
         raise unknown_name("parameter to tie to", master, names)
-    for missing in [*priors, *(f for f in frozen if f not in names)]:
+    for missing in [*priors, *(f for f in fixed if f not in names)]:
         raise unknown_name("parameter", missing, names)
     return Model(name=name, template=jax.tree.map(array, instrument), parameters=tuple(parameters))

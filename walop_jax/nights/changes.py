@@ -17,7 +17,7 @@ from scipy import linalg
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.nights.algebra import Solution, cholesky_solve
 
-NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
+NOTHING = 1e-9  # fraction of its information below which a change is taken up by the laws altogether
 
 
 def _information(

@@ -38,7 +38,7 @@ from walop_jax.nights.together import Night, source_of
 from walop_jax.posterior.run import Run
 
 SKETCH = 512  # measurements by which sets are compared
-COPIED = 0.02  # their share that no two sets have in common by chance
+COPIED = 0.02  # their fraction that no two sets have in common by chance
 
 
 class Data(NamedTuple):
@@ -169,7 +169,7 @@ def made(maker: Maker, executor: Executor | None, tasks: Sequence[Task]) -> Iter
 def sketch(calset: CalibrationSet, table: TableIntensities) -> frozenset[int]:
     """Sketch of the measurements of a set, whatever their times: the same ones have the same hashes (MinHash).
 
-    The smallest of the hashes of (X, Y, counts); the share that two sketches have in common is that of the sets
+    The smallest of the hashes of (X, Y, counts); the fraction that two sketches have in common is that of the sets
     (Broder 1997).
     """
     rows = table.used & ~calset.exposures.flux_known[table.exposure]

@@ -6,7 +6,7 @@ It is valid from half a day before the first exposure until walks and drifts hav
 (the local inverse has a condition number below 10); at the latest after as long again as the nights span, as nothing
 vouches for more, and not before half a day after the last exposure. Validity is half-open, and parted, without gaps,
 where something breaks. Between the last exposure before a break that was found and the first after it, it may have
-happened at any time: the calibration takes a share of it there, and its variance.
+happened at any time: the calibration takes a fraction of it there, and its variance.
 """
 
 from __future__ import annotations
@@ -173,7 +173,8 @@ class Survey(Drawn):
 
     @functools.cached_property
     def _matrix(self) -> OfMatrix | None:
-        """Matrix, derivatives and covariance of structure where one exposure measures u; the share where it does not.
+        """Matrix, derivatives and covariance of structure where one exposure measures u, and the fraction of the field
+        where it does not.
 
         None where p is not measured.
         """

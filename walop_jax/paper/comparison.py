@@ -62,7 +62,7 @@ class Offsets:
     condition: Float[np.ndarray, " p"]
 
     def document(self) -> dict[str, Any]:
-        """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
+        """Sizes in per cent, and the fraction of the variance of Δ that the weakest direction explains."""
 
         def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
             sizes = np.append(np.sqrt(np.mean(values**2, axis=0)), np.abs(values).max(axis=0))

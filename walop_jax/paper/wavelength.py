@@ -72,7 +72,7 @@ def colour_spread(
 
 
 def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
-    """Median and maximum in per cent, and the shares of the field below 0.01 % and 0.05 %."""
+    """Median and maximum in per cent, and the fractions of the field below 0.01 % and 0.05 %."""
     document = {}
     for name, values in zip("qu", spread.T, strict=True):
         shares = {"share_negligible": values < NEGLIGIBLE, "share_below_sensitivity": values < GOAL}

@@ -92,7 +92,7 @@ class ExposurePlan(Displayed):
 
     @property
     def efficiency(self) -> float:
-        """Share of the time in which the best plan of any exposures would be as good, but for prior knowledge."""
+        """Fraction of the time in which the best plan of any exposures would be as good, but for prior knowledge."""
         return self.criterion.variance(self.bound) / self.criterion.variance(self.value)
 
     @property
@@ -102,7 +102,7 @@ class ExposurePlan(Displayed):
 
     @property
     def share(self) -> float | None:
-        """Share of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
+        """Fraction of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
         errors = self.after[:, np.isfinite(self.after).all(axis=0)]
         return float(np.mean(errors < GOAL)) if errors.size else None
 

@@ -58,7 +58,7 @@ _BETTER, _PATIENCE = (
 _STEPS = 300  # of L-BFGS-B in a round
 _SPREAD, _OF_EACH = 96, 3  # candidates that a search begins with: of all families, of each at least
 _TOPS, _OF_FAMILY = 24, 3  # candidates that may join in a round: of all families, of each
-_LEAST_WEIGHT = 1e-5  # share of the budget below which a candidate leaves
+_LEAST_WEIGHT = 1e-5  # fraction of the budget below which a candidate leaves
 _UNSEEN = 1e-13  # eigenvalue, of the scaled information of everything, below which a direction is not seen
 _NOTHING = 1e-9  # of the information of everything
 _NEAR = 0.8  # of the largest variance: targets below it wait until they are among the largest
@@ -327,7 +327,7 @@ class Some:
         return float((top * total ** (1.0 / power)).mean()), slope
 
     def solved(self, share: WeightVector, power: float, gap: float) -> WeightVector:
-        """Shares of the budget with the least power mean; those given are where the search begins."""
+        """Fractions of the budget with the least power mean; those given are where the search begins."""
         each, begin = self.experiment.budget / self.costs, [share]
         if power <= _POWERS[0]:
             return self._solved(share, power, gap)

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 
 MOVES = ("laplace", "de", "stretch")
-JUMPS = 0.1  # share of γ = 1 among differential evolution
+JUMPS = 0.1  # fraction of γ = 1 among differential evolution
 WIDER = 1.1  # than the Laplace approximation: its draws as proposals
 LEAST_WALKERS = 64  # unless a number is asked for
 
@@ -84,7 +84,7 @@ def _laplace_draws(
 
 
 def mixture(moves: str) -> list[tuple[Any, float]]:
-    """Return emcee's moves with their shares; ValueError for an unknown name."""
+    """Return emcee's moves with their fractions; ValueError for an unknown name."""
     from emcee import moves as made
 
     if moves not in MOVES:

@@ -193,7 +193,7 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
 
 DescribedColumn = tuple[np.ndarray, str, str]  # values, unit, description
 
-BURN_IN = 0.2  # share of the steps that is not used
+BURN_IN = 0.2  # fraction of the steps that is not used
 LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 """Quantiles of the intervals: ± 1 and ± 2 standard deviations of a normal distribution."""
 
@@ -249,7 +249,7 @@ class Options:
 
 
 class Progress(NamedTuple):
-    """Contents of a progress bar: the stage, the share of it that is done (0 … 1), τ in steps, effective samples."""
+    """Contents of a progress bar: the stage, the fraction of it that is done (0 … 1), τ in steps, effective samples."""
 
     stage: str
     share: float
@@ -264,7 +264,7 @@ Report = Callable[[Progress], None]
 class PosteriorSample(Drawn):
     """The posterior of all coefficients.
 
-    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
+    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and fixed ones
     included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
     figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
     convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
@@ -351,7 +351,7 @@ class PosteriorSample(Drawn):
 
     @property
     def varying(self) -> list[int]:
-        """Positions of the coefficients that vary; tied ones do, frozen ones do not."""
+        """Positions of the coefficients that vary; tied ones do, fixed ones do not."""
         return [i for i in range(len(self.names)) if np.ptp(self.draws[:, :, i]) > 0]
 
     @property

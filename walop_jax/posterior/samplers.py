@@ -71,7 +71,7 @@ class Density:
 
 
 class Stretch(NamedTuple):
-    """Result of a number of steps: positions, their ln p, and the share of proposals accepted.
+    """Result of a number of steps: positions, their ln p, and the fraction of proposals accepted.
 
     `counts` are numbers that the sampler wants to be reported, summed over all stretches.
     """

@@ -61,7 +61,7 @@ class Ensembles:
 
     @property
     def acceptance(self) -> float:
-        """Share of proposals accepted in the steps that are stored."""
+        """Fraction of proposals accepted in the steps that are stored."""
         return float(np.mean([stretch.acceptance for stretch in self.stretches]))
 
     @property

@@ -289,7 +289,7 @@ def build_surrogate(
 
 
 def _prior_form(target: Target, along: Stacked, across: Stacked, n_features: int) -> Stacked:
-    """Q of priors and loose pulls: they are linear in x, hence exact."""
+    """Q of priors and weak pulls: they are linear in x, hence exact."""
     first = target.prior_rows(target.centre)
     rows = np.zeros((len(first), n_features))
     rows[:, 0] = first
@@ -322,7 +322,7 @@ def _common_axes(data: Stacked, prior: Stacked) -> tuple[Stacked, Float[np.ndarr
 class Accuracy:
     """The surrogate against the exact posterior at `count` draws of the former, all coefficients together.
 
-    `spread` is the standard deviation of ln(exact/surrogate), `efficiency` the effective share of importance
+    `spread` is the standard deviation of ln(exact/surrogate), `efficiency` the effective fraction of importance
     weights. The exact posterior has means that differ by `shift` standard deviations and widths that differ
     by the factor `width` from those of the surrogate: the worst of all coefficients, ± one standard error.
     """

@@ -1,6 +1,6 @@
 """The posterior that is sampled, exactly as the fit minimises it, and which coefficients are sampled.
 
-    −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
+    −2 ln p(x) = χ²(data) / noise_scale² + priors + weak pulls          fluxes eliminated as in `engine`
 
 Where errors of the data have parameters, the other terms of `likelihood/noise.py` are part of it.
 
@@ -75,7 +75,7 @@ class Target:
         return scale[:, None] * np.linalg.cholesky(self.covariance / np.outer(scale, scale))
 
     def values(self, x: FreeValues) -> Float[np.ndarray, " n"]:
-        """All parameters, frozen and tied ones included."""
+        """All parameters, fixed and tied ones included."""
         return self.model.full(x, self._fitted)
 
     def residuals(self, x: FreeValues, batch: engine.PointData) -> Float[np.ndarray, " d"]:
@@ -85,7 +85,7 @@ class Target:
         return np.asarray(r).ravel() / self.noise_scale
 
     def prior_rows(self, x: FreeValues) -> Float[np.ndarray, " k"]:
-        """Normalised residuals of priors and loose pulls: linear in x."""
+        """Normalised residuals of priors and weak pulls: linear in x."""
         return self.likelihood.priors.residuals(self.values(x))
 
     def prior_slopes(self, steps: Float[np.ndarray, "f m"]) -> Float[np.ndarray, "k m"]:

@@ -83,7 +83,7 @@ def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndar
 def _histogram(axis: Axes, likelihood: Likelihood, values: Parameters) -> None:
     """All residuals of a fit, and what noise alone would give."""
     _, residual = likelihood.residuals(values)
-    # A flux takes the share y²/Σy² of the variance of every intensity y, in units of its error.
+    # A flux takes the fraction y²/Σy² of the variance of every intensity y, in units of its error.
     square = (likelihood.points.gathered("counts") * likelihood.points.gathered("weight")) ** 2
     together = likelihood.model.template.cameras.together
     power = square @ (np.ones((likelihood.cameras,) * 2) if together is None else np.asarray(together))
@@ -237,7 +237,7 @@ _RANGE = (1e-4, 3.0)  # per cent
 
 @styled
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
-    """The error of p over the field (%, logarithmic; a line at the goal), and the share of the field that has it."""
+    """The error of p over the field (%, logarithmic; a line at the goal), and the fraction of the field that has it."""
     goal = 100.0 * accuracy.goal
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure, ((left, right),) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))

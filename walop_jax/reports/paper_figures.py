@@ -128,7 +128,7 @@ def transmission_figure(
     on: Canvas = PAGE,
     cameras: Cameras | None = None,
 ) -> AnyFigure:
-    """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
+    """Fraction of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
     With the model of Paper II, a constant plus terms in q and u of the polariser; its residuals below.
     """

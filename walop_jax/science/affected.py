@@ -26,7 +26,7 @@ from walop_jax.sky.nights import night_of
 
 ASKED = "ask the catalogues that the old calibration has made, by that calibration"
 LIMIT = 0.5  # standard errors; a result that is off by a quarter of its variance is made again
-MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
+MOST = 0.95  # fraction of the stars of a night that may shift by no more than the limit
 
 
 class NightShift(NamedTuple):

@@ -53,7 +53,7 @@ STAR_ROWS = 16384  # rows of a star catalogue that are worked on together: their
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
-_STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
+_STRAIGHT = 0.01  # … until second derivatives make less difference than this fraction of the noise, squared
 _KNOWN = 0.1  # error of q and u together from which a star says nothing of the arms
 IMPROBABLE = 1e-6  # probability of a CHI2 as large below which FLAG 131072 is set, …
 ROUGH = 0.005
@@ -68,7 +68,7 @@ class Stars:
     is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
     error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since the calibration
     that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
-    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake that
+    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single error that
     the data of the calibration would not have shown (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts
     the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of the sky left
     over that they do not exclude (None: the level of the sky is not stated).
@@ -553,7 +553,7 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
 def _hidden(
     vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
 ) -> QuOfStars:
-    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where not computed.
+    """Largest shift of q and u by one of the systematic errors that would not have been found; NaN where not computed.
 
     `acting` are the shifts by those that act on starlight (`AnalysisVectors.acting`): parameters make up for a part.
     """

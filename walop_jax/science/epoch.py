@@ -65,7 +65,7 @@ UNEXPLAINED = (
 STACK = "walop-jax stack RUN NEW.fits -o SURVEY dates the change and gives one calibration for all nights"
 _SHOWN = 8  # parameters
 SURE = 5.0  # standard errors
-_KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
+_KNOWN = 1e-7  # fraction of the largest eigenvalue below which a direction was measured by neither
 _LEANS = 1e-4  # of the variances of both fits, below which both are the prior, and rounding differs
 
 

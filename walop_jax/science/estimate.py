@@ -70,7 +70,7 @@ def estimate(
     """Stokes parameters of stars from rows of intensities.
 
     A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN. Where the
-    shares of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row.
+    fractions of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row.
 
     `vectors` (row, camera, Stokes) are the analysis vectors in the frame that (q, u) are wanted in; counts that
     are not finite, or whose `sigma` is not finite and above 0, are not used. `star` numbers the stars from 0

@@ -1,4 +1,4 @@
-"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and mistakes that could hide.
+"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and errors that could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
@@ -37,7 +37,7 @@ from walop_jax.likelihood.inverses import whitening
 
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
-NEXT_HIDDEN = 2  # mistakes that could hide, told beside the worst
+NEXT_HIDDEN = 2  # undetected errors, told beside the worst
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -56,13 +56,13 @@ GROUPS = {
 class FieldAccuracy:
     """Standard error of p (a fraction) over the field, from the calibration alone: rms over stars with p ≤ 5 %.
 
-    `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
-    mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
+    `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A systematic
+    error that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
     median over the field (NaN: not computed), at its just undetected size, `hidden_worst` where it is largest; `remedy`
-    is the measurement that would show it; `next_hidden` are those that follow. `not_measured` are the mistakes on which
-    the data hold no information.
-    `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
-    where it does (None: everywhere). `goal` is what p of a star is wanted to: the calibration may make half of it.
+    is the measurement that would show it; `next_hidden` are those that follow. `not_measured` are the errors on which
+    the data hold no information. `without_u` is the fraction of the field where a single exposure carries almost no
+    information on u, `with_u` says where it does (None: everywhere). `goal` is what p of a star is wanted to: the
+    calibration may make half of it.
     """
 
     error: Float[np.ndarray, "y x"]
@@ -92,7 +92,7 @@ class FieldAccuracy:
 
     @property
     def share(self) -> float:
-        """Share of the field in which the error is below the goal."""
+        """Fraction of the field in which the error is below the goal."""
         return float(np.mean(self.error < self.goal))
 
     @property
@@ -152,11 +152,11 @@ class FieldAccuracy:
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
-        """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
+        """The answer in a few lines: accuracy, its limits, errors that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         apart = " behind the telescope" if self.not_measured else ""
-        if not all(mistake.ahead for mistake in self.not_measured):
+        if not all(each.ahead for each in self.not_measured):
             apart = " apart from quantities not measured"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
         median_error = f"{per_cent(self.median)} %{apart} (median error for p ≤ 5 %)"
@@ -183,7 +183,7 @@ class FieldAccuracy:
 
     @property
     def further_facts(self) -> tuple[tuple[str, str], ...]:
-        """The mistakes that could hide beside the worst one, each with its effect on stars and what would show it."""
+        """The errors that could hide beside the worst one, each with its effect on stars and what would show it."""
         lines = (
             f"{entry.in_words}: {off_by(*entry.error)}{f'; {entry.remedy}' if entry.remedy else ''}"
             for entry in self.next_hidden
@@ -286,8 +286,8 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
     error = p_errors(matrix[: size**2], covariance[: size**2]).reshape(size, size)
     with_u = measures_u(matrix[: size**2].reshape(-1, 2, 3)).reshape(size, size)
-    mistakes = could_hide(calibration)
-    worst = mistakes[0] if mistakes else None
+    undetected = could_hide(calibration)
+    worst = undetected[0] if undetected else None
     nothing = np.nan if calibration.hidden is None else 0.0
     return FieldAccuracy(
         error,
@@ -298,12 +298,12 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
         hidden_by="" if worst is None else worst.in_words,
         hidden_worst=nothing if worst is None else worst.error[1],
         remedy="" if worst is None else worst.remedy,
-        not_measured=tuple(mistake for mistake in mistakes if not mistake.measured),
+        not_measured=tuple(each for each in undetected if not each.measured),
         trusted=calibration.verdict.trusted,
         without_u=float(np.mean(~with_u)),
         with_u=with_u,
         goal=goal,
-        next_hidden=mistakes[1 : 1 + NEXT_HIDDEN],
+        next_hidden=undetected[1 : 1 + NEXT_HIDDEN],
     )
 
 

@@ -88,7 +88,7 @@ class OwnLight:
 
 
 class ArmChange(NamedTuple):
-    """A change of the balance of an arm: the share by which its first camera is brighter against the second.
+    """A change of the balance of an arm: the fraction by which its first camera is brighter against the second.
 
     `error` is inf where the stars hold nothing on it; `chance` is that of a size as large without the change.
     """

@@ -41,7 +41,7 @@ from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.sky.nights import night_of
 
 POLARISED = 0.005  # catalogued p from which a standard shows angle and p, and below which it shows the zero
-HELD = 1e-3  # share of the information of the catalogue that the data must add to a star
+HELD = 1e-3  # fraction of the information of the catalogue that the data must add to a star
 BEYOND = 2.0  # standard errors beyond a limit
 
 ERRORS = {"ANGLE": "ANGLE_ERR", "P_RATIO": "P_RATIO_ERR", "ZERO_Q": "ZERO_ERR", "ZERO_U": "ZERO_ERR"}

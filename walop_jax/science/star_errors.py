@@ -122,7 +122,7 @@ def _two_by_two(vectors: RowVectors) -> CameraPairs:
 
 
 def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
-    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
+    """Median, rms, 95 % and maximum over the field of each error in per cent; fraction of the field under 0.1 %."""
     numbers = {}
     for name, values in zip(QUANTITIES, (errors if chosen is None else errors[chosen]).T, strict=True):
         sizes = np.median(values), np.sqrt(np.mean(values**2)), np.quantile(values, 0.95), np.max(values)

@@ -33,7 +33,7 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     def pair(end: str, values: Float[np.ndarray, "s 2"], about: str) -> dict[str, tuple[np.ndarray, str]]:
         return {f"{name}{end}": (values[:, k], about.format(name)) for k, name in enumerate("QU")}
 
-    hidden = "largest shift of {} by a mistake that calibration data would not show"
+    hidden = "largest shift of {} by a systematic error that calibration data would not show"
     columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),

@@ -74,9 +74,9 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     """An instrument as it might have been built.
 
     Every parameter with a prior is drawn from it (efficiencies of analysers stop at 1), tied ones follow; throughputs
-    are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
-    share is a gauge, so the constant of camera N0 is 0.5; of arms whose share of the light is unknown the first camera
-    is 0.5 all over. Other parameters without a prior stay at their start values.
+    are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras share
+    is a gauge, so the constant of camera N0 is 0.5; of arms whose fraction of the light is unknown the first camera is
+    0.5 all over. Other parameters without a prior stay at their start values.
     """
     values = model.start
     for i, p in enumerate(model.parameters):

@@ -89,7 +89,7 @@ class GainOfExposures(_Cameras, ExposurePart):
 
 
 class CrossTalk(Mixing):
-    """Shares of the light of cameras in other ones."""
+    """Fractions of the light of cameras in other ones."""
 
     amplitudes: tuple[Scalar, ...]
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (target, origin)
@@ -102,7 +102,7 @@ class CrossTalk(Mixing):
 
 
 class Ghost(GhostPart):
-    """Shares of the light of the opposite field point, for extended sources."""
+    """Fractions of the light of the opposite field point, for extended sources."""
 
     shares: Float[Array, " k"]
 

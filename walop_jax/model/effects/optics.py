@@ -3,7 +3,7 @@
 Equation    M → M_Δ M_R M_D M at one place of the train, with
             M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k_q, k_u, k_v)
 Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
-            diagonal: −2xy and x² − y²; k = 1 − its lost share; a turn by α is r_v = −2α
+            diagonal: −2xy and x² − y²; k = 1 − its lost fraction; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Limits      exact for one kind at a place; the order of several kinds matters at second order
 """
@@ -83,7 +83,7 @@ def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
 
 def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg)."""
-    sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the share that is lost
+    sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the fraction that is lost
     for change, size in terms:
         for name, coefficient, factors in generators_of(change.kind):
             by = coefficient * product(factors, AtPoint(x, y), change.units)

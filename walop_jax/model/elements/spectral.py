@@ -6,7 +6,7 @@ Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) spread(s) retarde
             `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
 Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ rotation [deg] of the polarisation
             from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
-            loss lost share of q, u, v; s lost share of the components not along `axis`, 1 − exp(−σ²/2) for a rms
+            loss lost fraction of q, u, v; s lost fraction of the components not along `axis`, 1 − exp(−σ²/2) for a rms
             spread σ [rad] of the retardance over the beam or the band
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
