@@ -12,6 +12,7 @@ import pytest
 from astropy.table import Table
 from one_arm import POLARISER, one_arm
 
+import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
@@ -37,13 +38,14 @@ VOLTS = (-5.0, 5.0)
 
 
 class VoltageCell(Element):
-    """A retarder whose retardance grows with a voltage; it says nothing of a period."""
+    """A retarder whose retardance grows with a voltage; it has a unit, and says nothing of a period."""
 
     base: Scalar = number("rad", "retardance at 0 V")
     slope: Scalar = number("rad", "change per volt")
     axis: Scalar = number("deg", "fast axis")
     volt: float = eqx.field(static=True, default=0.0)
     kind: ClassVar[str] = "voltage_cell"
+    reading_unit: ClassVar[str] = "V"
 
     def turned(self, angle):
         return dataclasses.replace(self, volt=float(angle))
@@ -202,3 +204,21 @@ def _window(tmp_path) -> Instrument:
     path = tmp_path / "window.toml"
     path.write_text(one_arm("WINDOW", ["polariser", "modulator"], POLARISER + window))
     return Instrument.read(path)
+
+
+class SilentCell(VoltageCell):
+    """The same, but it says nothing of the unit of its reading."""
+
+    kind: ClassVar[str] = "silent_cell"
+
+    def turned(self, angle):
+        return super().turned(angle)
+
+
+def test_a_reading_is_written_with_its_unit(instrument, calibration):
+    """Degrees of what turns, volts of what says so, and the number alone where nothing is said."""
+    assert nominal_instrument().reading_in_words("CHWP", 22.5) == "22.5°"
+    assert instrument.reading_in_words("FLC", -5.0) == "−5 V"
+    assert SilentCell.reading_in_words(-5.0) == "−5"
+    assert SilentCell.period is None
+    assert "FLC at −5 V" in str(walop.matrix(calibration, x=0.0, y=0.0, at={"FLC": -5.0}))

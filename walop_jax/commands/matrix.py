@@ -109,6 +109,7 @@ def matrix(
     )
     result = MatrixTable(outcome.value, copy=False)
     result.meanings = {int(bit): bit.meaning for bit in Quality}
+    result.reading = instrument.reading_in_words
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     text = f"{output}: {table.rows} rows, {crossed} of them in zones of high cross-talk"
     advice = (typed("matrix", "RUN", "--points", "TABLE", "-o", "OUT.fits"),) if output is None else ()

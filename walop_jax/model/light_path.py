@@ -147,6 +147,11 @@ class LightPath(Component):
         elements = (e for e in self.ahead_of_analysers() if not isinstance(e, Polariser))
         return tuple(dict.fromkeys(element.moves for element in elements if element.moves))
 
+    def reading_in_words(self, prefix: str, reading: float) -> str:
+        """A reading of the elements that move as `prefix`, with their unit: 45°, 5 V, or the number alone."""
+        words = {e.reading_in_words(reading) for e in self.ahead_of_analysers() if e.moves == prefix}
+        return words.pop() if len(words) == 1 else f"{reading:g}"
+
     def within_period(self, prefix: str, readings: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Readings of the elements that move together as `prefix`, reduced to one period (`Element.period`).
 

@@ -97,7 +97,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
             about = element.__doc__ or ""
             if element.moves is not None:
                 (angle,) = fold.angles_of(element, plan.moving, plan.positions[:1])
-                about = "out of the beam" if angle is None else f"at {angle:g}°"
+                about = "out of the beam" if angle is None else f"at {element.reading_in_words(angle)}"
             stages.append(_one(element.name, about, weight @ nodes))
     of_arms = [
         weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.text import with_minus_sign
 from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.ray import Ray
 
@@ -28,9 +29,10 @@ class Element(Component):
     `declared` holds the parameters of the instrument among its numbers, by field. `path_difference` (µm) is the largest
     optical path between interfering waves: the wavelength nodes must follow its fringes.
 
-    `period` is the change of a reading (the number in `<P>_ANGLE`) after which an element that moves acts as before:
-    360 for an angle in degrees, None for a reading that never repeats itself, such as a voltage. A class that writes
-    `turned` or `position` anew and says nothing of its period has None, which is right for every reading.
+    A reading is the number in `<P>_ANGLE` of an element that moves. `reading_unit` is its unit in print: "deg", or "V"
+    for a voltage. `period` is the change of a reading after which the element acts as before: 360 for an angle in
+    degrees, None for a reading that never repeats itself, such as a voltage. A class that writes `turned` or `position`
+    anew and says nothing of unit and period has no unit and the period None, which is right for every reading.
 
     >>> class Dimmer(walop.Element):
     ...     "A filter that is grey."
@@ -49,13 +51,21 @@ class Element(Component):
     kind: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     period: ClassVar[float | None] = 360.0
+    reading_unit: ClassVar[str] = "deg"
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Nothing is known of the period of a class that gives readings a meaning of its own."""
+        """Nothing is known of unit and period of a class that gives readings a meaning of its own."""
         super().__init_subclass__(**options)
         own = vars(cls)
-        if "period" not in own and ("turned" in own or "position" in own):
-            cls.period = None
+        if "turned" in own or "position" in own:
+            cls.period = own.get("period")
+            cls.reading_unit = own.get("reading_unit", "")
+
+    @classmethod
+    def reading_in_words(cls, reading: float) -> str:
+        """A reading with its unit: 45°, 5 V, or the number alone."""
+        text = with_minus_sign(f"{reading:g}")
+        return f"{text}°" if cls.reading_unit == "deg" else f"{text} {cls.reading_unit}".rstrip()
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the element."""

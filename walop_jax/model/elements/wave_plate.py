@@ -106,6 +106,7 @@ class WavePlate(Element):
 
     kind: ClassVar[str] = "wave_plate"
     period: ClassVar[float | None] = 360.0  # its own `turned` keeps the reading for factors of that angle
+    reading_unit: ClassVar[str] = "deg"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1980, Surf. Sci. 96, 41"
 
     def turned(self, angle: float) -> Self:
