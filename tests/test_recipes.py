@@ -29,7 +29,7 @@ SCRIPTS = {
 SAID = {
     "The posterior of two thicknesses": "half1.plate.mgf2",
     "p of my stars": "P_DEBIASED",
-    "Freeze the wedge": "fixed",
+    "Fix the wedge": "fixed",
     "An effect of my own": "Diagnosis (",
     "Compare two nights": "the instrument has changed",
     "My arrays": "Fit of WALOP-SOUTH",

@@ -7,8 +7,8 @@ Surface     Frames are cut into blocks. To the pixels of a block a surface is fi
             independent errors, σ/√(w n) each with w n the pixels that the point stands for, its cell; and the next
             polynomial, the largest of those left out, is zero there. A mean over a cell, taken for the value at its
             middle, is off by side²/24 · ∇²; these values by the eighth power of the side of a block.
-Light       Fitted are shares N_k/L of the light L = Σ_k N_k of a pixel, and N_k = share · (surface of L) at the points:
-            what the cameras have in common, such as the illumination of the field, may be as rough as it likes. Of
+Light       Fitted are fractions N_k/L of the light L = Σ_k N_k of a pixel, and N_k = fraction · (surface of L) at the
+            points: what the cameras have in common, such as the illumination of the field, may be as rough as it likes. Of
             photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
             faint, L = 1, and the surface is that of the counts themselves.
 Weights     N_ERR of the pixels is made from their counts: weights 1/σ² would favour pixels that happen to be faint. All
@@ -17,8 +17,8 @@ Bad pixels  A pixel that is bad in one camera is left out of that exposure. Surf
             the errors that follow. A block without the pixels that its surface needs, at the edge of a round field,
             keeps one point for each part with pixels, at their mean position, and a surface that these can hold.
 Structure   Residuals r of a pixel about the surfaces that agree between exposures: with q = L s(1 − s), the change of
-            counts by a gain of one camera (share s), Σ_{e≠e'} r_e r_e' = g² Σ_{e≠e'} q_e q_e' over exposures e,
-            whatever the noise is, as long as it is independent. See `FineStructure`. Pixels of single spots, which
+            counts by a gain of one camera with the fraction s, Σ_{e≠e'} r_e r_e' = g² Σ_{e≠e'} q_e q_e' over exposures
+            e, whatever the noise is, as long as it is independent. See `FineStructure`. Pixels of single spots, which
             no surface holds, are left out of all exposures.
 Sources     Golub & Welsch 1969, Mathematics of Computation 23, 221 (zeros as eigenvalues); Szegő 1939, Orthogonal
             Polynomials, §3.4 (independence of values at zeros).
@@ -44,8 +44,8 @@ from walop_jax.data.units import Place
 from walop_jax.io.shapes import Vector
 
 CELLS = 80
-"""Cells along the longer side of frames, unless the user says otherwise: parameters are within 0.05 standard errors of
-those of a fit to all pixels."""
+"""Cells along the longer side of frames, unless the user says otherwise: parameters then lie within 0.05 standard
+errors of a fit to all pixels."""
 ORDER = 4
 """Points along a side of a block."""
 BRIGHT = 20.0
@@ -65,10 +65,10 @@ _PART = 0.1  # of the pixels of the fullest part of a block: parts that have les
 def orthonormal(
     places: Vector, order: int, weight: Vector | None = None
 ) -> tuple[Float[np.ndarray, " o"], Float[np.ndarray, "o o"]]:
-    """The polynomials of degrees 0 to `order` − 1 that are orthonormal over places between −1 and 1.
+    """The polynomials of degrees 0 to `order` − 1 that are orthonormal over some places between −1 and 1.
 
-    `weight` is that of each place; None: 1. Returns the zeros of the next polynomial, and the matrix that makes the
-    polynomials of Legendre's: `legvander(x, order - 1) @ matrix`.
+    `weight` is the weight of each place; None: all have weight 1. Returns the zeros of the next polynomial, and the
+    matrix that makes these polynomials from Legendre's: `legvander(x, order - 1) @ matrix`.
     """
     plain = legvander(places, order - 1)
     values, triangle = np.linalg.qr(plain if weight is None else np.sqrt(weight)[:, None] * plain)
@@ -222,7 +222,7 @@ class _Binning:
                 self.tally.spots += int(spots.sum())
             found += points
             structure.append(patches)
-        remarks = self._judged()
+        remarks = self._checked_pixels()
         column, row, *data = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
         x, y = self.frames.grid.at(column, row)
         points = Points(np.arange(len(x), dtype=np.int32), x, y)
@@ -492,7 +492,7 @@ class _Binning:
 
     # ----------------------------------------------------------------------------------------------------- verdict
 
-    def _judged(self) -> list[str]:
+    def _checked_pixels(self) -> list[str]:
         """Refuse frames that cannot be measurements; remarks on pixels that are not used."""
         tally, last = self.tally, self.frames.cameras - 1
         place, images = Place(self.path, "N0"), f"N0…N{last}, E0…E{last}"

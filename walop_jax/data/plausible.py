@@ -42,7 +42,7 @@ _NEGATIVE = 5.0  # standard errors
 
 
 class Implausible(NamedTuple):
-    """A sentence about a column."""
+    """A sentence that doubts the values of one column."""
 
     column: str
     what: str

@@ -18,10 +18,10 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-SAMPLED_TOGETHER = 64  # field points that are sampled together
+SAMPLED_TOGETHER = 64  # neighbouring field points that a sample takes together
 SPOT = 8.0  # standard errors from which a patch of the field holds structure of its own
 ROUNDING = 1e-10  # mean square gain of the rounding of numbers without noise
-FINE = 4.0  # standard errors from which the whole field holds some
+FINE = 4.0  # standard errors from which the whole field holds structure
 
 
 class DataFlag(enum.IntFlag):
@@ -55,7 +55,9 @@ class Site:
 
 
 class ErrorWord(NamedTuple):
-    """One number of `StatedErrors`: its word in a primary header, its unit, its usual size, what it is the error of."""
+    """One number of `StatedErrors`: its word in a primary header, its unit, its usual size, and what it is the error
+    of.
+    """
 
     word: str
     unit: str
@@ -133,12 +135,12 @@ class StatedErrors:
 
     @property
     def stated(self) -> dict[str, float]:
-        """Those that differ from the usual ones."""
+        """The errors that differ from the usual ones, by name."""
         return {n: v for n, v in dataclasses.asdict(self).items() if v != ERROR_WORDS[n].usual}
 
     @classmethod
     def of(cls, given: Mapping[str, float]) -> StatedErrors:
-        """The usual errors, some of them given; ValueError, with the nearest names, for one that there is not."""
+        """The usual errors with some replaced; ValueError, with the nearest names, for a name that does not exist."""
         for name in given:
             if name not in ERROR_WORDS:
                 raise ValueError(f"stated_errors: there is none of {name!r}; {nearest(name, ERROR_WORDS)}")
@@ -146,7 +148,7 @@ class StatedErrors:
 
     @classmethod
     def largest(cls, given: Iterable[StatedErrors]) -> StatedErrors:
-        """Of each number the largest error."""
+        """For each number the largest of the errors given."""
         columns = zip(*(dataclasses.astuple(entry) for entry in given), strict=True)
         return cls(*map(max, columns))
 
@@ -169,10 +171,10 @@ class FilterCurve:
 
 @dataclasses.dataclass(frozen=True)
 class Position:
-    """State of a moving element in every exposure: in the beam or not, and at what angle.
+    """What a moving element does in every exposure (e): whether it is in the beam, and at what angle.
 
-    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle by
-    which it turns during the exposure, evenly in time (deg; 0, or None for all: it stands still).
+    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle (deg)
+    by which it turns during the exposure, evenly in time (0, or None for all exposures: it stands still).
     """
 
     inside: Bool[np.ndarray, " e"]
@@ -289,7 +291,7 @@ class Exposures:
         raise ValueError(f"the exposures have no moving element {prefix!r}: {advice}{like}")
 
     def placed(self, **positions: Position) -> Exposures:
-        """The same with moving elements, by column prefix, at other positions."""
+        """The exposures with moving elements, by column prefix, at other positions."""
         return dataclasses.replace(self, positions={**self.positions, **positions})
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -383,7 +385,7 @@ Arrays = TypeVar("Arrays")
 
 
 def _one_after_the_other(kind: type[Arrays], parts: Sequence[Arrays]) -> Arrays:
-    """A record of arrays whose arrays are those of some parts, joined along their first axis."""
+    """A record whose arrays are the arrays of all `parts`, joined along their first axis."""
     names = [field.name for field in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -422,8 +424,8 @@ class FineStructure:
     """Structure in whole frames that is finer than their cells, in patches of the field at `x`, `y` (degrees).
 
     `gain` is the mean square, over the pixels of a patch, of the relative gain of a camera against its surroundings, as
-    far as exposures agree on it; chance makes it negative as well. `error` is its standard error without any structure.
-    Patches of several files stand one after the other.
+    far as exposures agree on it; chance can make it negative. `error` is the standard error that it has without any
+    structure. Patches of several files stand one after the other.
     """
 
     x: Float[np.ndarray, " n"]
@@ -465,11 +467,11 @@ class FineStructure:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrationSet(Displayed):
-    """A calibration set, read, checked and free of units.
+    """A calibration set, read and checked; numbers have the units of the docstrings.
 
-    `intensities` gives the data of a slice of the points. `fine` is the structure that is finer than the cells of whole
-    frames, in a set that was made of these, `cells` how many along their longer side were asked for. `stated_errors`
-    are those of the numbers of the set.
+    `intensities` gives the data of a slice of the points. In a set that was made of whole frames, `fine` is the
+    structure that is finer than its cells, and `cells` how many cells along their longer side were asked for.
+    `stated_errors` are the errors of the numbers of the set.
 
     >>> calset.instrument, len(calset.exposures), len(calset.points)
     ('WALOP-SOUTH', 14, 29)
@@ -557,8 +559,8 @@ class CalibrationSet(Displayed):
 class Intensities:
     """The intensities of every (exposure, point): a table, or any other source.
 
-    `block` must be pure and may be called from several threads; the field points it counts in are those
-    of `CalibrationSet.points`, the exposures those of `CalibrationSet.exposures`.
+    `block` must be pure and may be called from several threads. It counts field points as `CalibrationSet.points` does,
+    and exposures as `CalibrationSet.exposures`.
     """
 
     def block(self, start: int, stop: int) -> Block:
@@ -577,7 +579,7 @@ class Intensities:
 
 
 def sampled(intensities: Intensities, total: int, most: int) -> tuple[Int[np.ndarray, " p"], Block]:
-    """Field points of a set of so many, `most` at most and in evenly spaced runs, and their data."""
+    """At most `most` of the `total` field points of a set, in evenly spaced blocks of neighbours, and their data."""
     if total <= most:
         return np.arange(total), intensities.block(0, total)
     starts = np.linspace(0, total - SAMPLED_TOGETHER, most // SAMPLED_TOGETHER).astype(int)

@@ -35,12 +35,12 @@ class Rule(NamedTuple):
 
 
 def finite(advice: str) -> Rule:
-    """No NaN, no infinity."""
+    """The rule that a value is neither NaN nor infinite."""
     return Rule(lambda values: ~np.isfinite(values), "is not finite", advice)
 
 
 def within(limit: float, advice: str, what: str = "") -> Rule:
-    """From −`limit` to `limit`; NaN passes."""
+    """The rule that a value lies from −`limit` to `limit`; NaN passes."""
     return Rule(lambda values: np.abs(values) > limit, what or f"exceeds ±{limit:g}", advice)
 
 

@@ -4,9 +4,10 @@ A unit (the exposures of one file in one night) says of the values θ of all par
 
     χ²_u(θ) = χ²_u + 2 g_uᵀ θ + θᵀ H_u θ,        θ = D_u x,
 
-with D_u the design of the laws for the unknowns x: `globals`, each with a function of time, and locals, that belong to
-one cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals
-(block tridiagonal, as a random walk couples neighbours and nothing else does) and B the block between them,
+with D_u the design of the laws for the unknowns x. Unknowns are either `globals`, each with a function of time, or
+locals, which belong to one cell: a night, or several nights that a file joins. With A the equations of the globals, T
+the equations of the locals (block tridiagonal, as a random walk couples neighbours and nothing else does) and B the
+block between them,
 
     S_c  = T_c − C_c S_{c−1}⁻¹ C_cᵀ,      B'_c = B_c − C_c S_{c−1}⁻¹ B'_{c−1}          forwards
     K    = A − Σ B'_cᵀ S_c⁻¹ B'_c                                                      the globals
@@ -62,7 +63,7 @@ class Equations:
 
 
 class Cell(NamedTuple):
-    """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions."""
+    """Unknowns of a cell (a night, or several that a file joins): parameters, the units in which each acts, priors."""
 
     units: Int[np.ndarray, " v"]
     parameter: Int[np.ndarray, " k"]
@@ -84,9 +85,10 @@ class Eliminated(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """The unknowns of equations under laws: what `solve` eliminates.
+    """The unknowns of equations under laws, which `solve` eliminates.
 
-    Of unknowns of all nights `at` are the parameters, `forms` the functions of time, `mean` and `precision` the priors.
+    For the unknowns of all nights, `at` are the parameters, `forms` the functions of time, `mean` and `precision` the
+    priors.
     """
 
     equations: Equations
@@ -108,7 +110,11 @@ class System:
         width: AnyVector,
         means: Bool[np.ndarray, " n"],
     ) -> System:
-        """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
+        """The unknowns that laws give equations.
+
+        `mean` and `width` (inf: none) are the priors, counted from the origin; `means` is true for parameters that have
+        a value by default.
+        """
         scale, middle = equations.scale, float(equations.mjd.mean())
         mean, precision = mean / scale, np.array([w**-2.0 for w in width / scale])
         every = [(i, *f) for i, law in enumerate(laws) if law for f in law.forms(bool(means[i]), middle)]
@@ -131,7 +137,9 @@ class System:
 
     @functools.cached_property
     def locals(self) -> list[tuple[int, int, int, Int[np.ndarray, " v"]]]:
-        """Of every unknown of a cell: the cell, its place in it, its parameter, the units that it acts in."""
+        """For every unknown of a cell: the cell, its position in the cell, its parameter, and the units in which it
+        acts.
+        """
         return [
             (c, k, i, cell.units[cell.covers[k] > 0])
             for c, cell in enumerate(self.cells)
@@ -140,7 +148,7 @@ class System:
 
     @functools.cached_property
     def states(self) -> dict[int, list[tuple[float, int, int]]]:
-        """The states of the walk of every parameter that walks, night by night: time (MJD), cell, place in the cell."""
+        """For every parameter that walks its states, night by night: time (MJD), cell, position in the cell."""
         states: dict[int, list[tuple[float, int, int]]] = {}
         for c, k, i, units in self.locals:
             if np.isfinite(self.rates[i]):
@@ -148,7 +156,7 @@ class System:
         return states
 
     def steps(self) -> Iterator[tuple[float, list[int], list[int]]]:
-        """The precision of every step of a walk, with cell and place of the states before and after it."""
+        """For every step of a walk its precision, and cell and position of the states before and after it."""
         for i, states in self.states.items():
             for (start, *before), (stop, *after) in itertools.pairwise(states):
                 yield 1.0 / (self.rates[i] ** 2 * (stop - start)), before, after
@@ -183,7 +191,7 @@ def _cells(
 
 
 class UndeterminedError(ValueError):
-    """Nothing determines an unknown; `parameter` is the one, `unit` one of its units, None: of all nights."""
+    """Nothing determines an unknown of `parameter`, in the unit `unit` (None: in all nights)."""
 
     def __init__(self, parameter: int, unit: int | None) -> None:
         super().__init__("the nights do not determine a parameter under its law")
@@ -323,7 +331,9 @@ class Solution:
 
     @functools.cached_property
     def smoothed(self) -> list[tuple[AnyMatrix, AnyMatrix]]:
-        """Of every cell the covariance of its unknowns, and that with the globals and the unknowns of the next cell."""
+        """For every cell the covariance of its unknowns, and their covariance with the globals and the unknowns of the
+        next cell.
+        """
         smoothed: list[tuple[AnyMatrix, AnyMatrix]] = []
         beside = self.covariance  # of the globals and the next cell: none behind the last
         for c in reversed(range(len(self.cells))):
@@ -430,6 +440,10 @@ class Solution:
 
 
 def _joined(covariance: AnyMatrix, block: AnyMatrix, others: AnyMatrix) -> AnyMatrix:
-    """A covariance with that of further unknowns, `block`; `others` is theirs with the first ones, and maybe more."""
+    """A covariance extended by further unknowns.
+
+    `block` is the covariance of the further unknowns, `others` their covariance with the first ones, and maybe with
+    more.
+    """
     cross = others[:, : len(covariance)]
     return np.block([[covariance, cross.T], [cross, block]])

@@ -53,9 +53,9 @@ def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k
 
 
 class Tried(NamedTuple):
-    """All changes of a solution: score and information by kind, cell and parameter (drifts have one cell).
+    """Scores and information of all changes of a solution, by kind, cell and parameter (drifts have one cell).
 
-    A value in all nights is no change, of which `always` is the information.
+    A value in all nights is no change; `always` is the information on it.
     """
 
     score: tuple[Float[np.ndarray, "_ n"], ...]
@@ -64,7 +64,7 @@ class Tried(NamedTuple):
 
     @classmethod
     def of(cls, solution: Solution, barred: Sequence[int] = ()) -> Tried:
-        """Scores of all changes; of those of `barred` parameters there is no information."""
+        """The scores of all changes; for `barred` parameters the information is 0."""
         mjd, n = solution.system.equations.mjd, len(solution.system.laws)
         course = np.repeat(((mjd - mjd.mean()) / YEAR)[:, None], n, axis=1)
         drift, of_drift = changes.weighted(solution, course, np.arange(n))
@@ -112,7 +112,8 @@ def find(
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...]]:
     """The breaks of a series, and the laws with them. Raises `UndeterminedError` where there is no solution.
 
-    Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
+    Of several names that explain a break equally well, the first one that is `carried` to stars becomes a law (None:
+    all are carried).
     """
 
     def largest_beside(others: Sequence[Break], chance: float) -> Break | None:
@@ -154,7 +155,9 @@ def _largest(
     catalogue: Sequence[EffectKind],
     carried: Carried | None,
 ) -> Break | None:
-    """The most significant change, of those alike the first that is carried; None where chance does as well."""
+    """The most significant change; of changes that look alike the first that is carried; None where chance does as
+    well.
+    """
     tried = Tried.of(solution, _other_shapes(data, solution.system.laws))
     kind, cell, i = tried.largest()
     z = tried.z(kind)

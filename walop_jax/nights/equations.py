@@ -4,9 +4,8 @@
 
 of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
 r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
-effects beyond the model can be tested afterwards without the data. So can the throughput that is held because the
-fluxes take it up: held in every night it is no gauge of what changes between them, as its camera may be the one that
-does.
+effects beyond the model can be tested afterwards without the data. So can the throughput that is fixed because the
+fluxes take it up: its camera may be the one that changes from night to night, and fixing it hides that.
 
 Nights follow from the exposures (`sky.nights`). A set of several nights is taken apart; each file and night is a unit
 of its own.
@@ -157,7 +156,7 @@ def with_candidates(
 
 
 def model_hash(model: Model) -> str:
-    """Of all that nights must have in common: instrument, physics, effects, ties and values that are held."""
+    """A hash of all that nights must have in common: instrument, physics, effects, ties and values of fixed parameters."""
     header = header_of(model)
     fixed = (p for p in model.parameters if (p.tie or not p.free) and p.part not in SKY_AND_STARS)
     held = [f"{p.name} {p.tie or repr(p.start)}" for p in fixed]
@@ -177,10 +176,10 @@ def night_equations(
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
-    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
-    whose `own` minimum is farther from the values than noise explains are linearised closer to it. `sets` is
-    how many such sets come. Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as
-    `split` does, and where the model has no finite counts.
+    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is wanted. With `own`,
+    nights whose minimum is farther from the values than noise explains are linearised closer to it. `sets` is how many
+    such sets come. For sets too large for a table of derivatives no candidates are kept. Raises `DataError` as `split`
+    does, and where the model has no finite counts.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])

@@ -42,7 +42,10 @@ COPIED = 0.02  # their fraction that no two sets have in common by chance
 
 
 class Data(NamedTuple):
-    """Data that nights can be made of at any values: a set, its file or a RUN; hash; model (None: that of `like`)."""
+    """Data of which nights can be made at any values of the parameters.
+
+    `source` is a set, the path of one or a RUN; `sha256` its hash; `model` None stands for the model of `like`.
+    """
 
     source: CalibrationSet | Path | Run
     sha256: str
@@ -56,7 +59,7 @@ class Data(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Nights to be made of `data`: those near their own minimum, or `night` once more, at `values`."""
+    """Nights to be made of `data`, each near its own minimum; or one `night` made again, at `values`."""
 
     data: Data
     night: Night | None = None

@@ -56,9 +56,10 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 class Survey(Drawn):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is a
-    calibration of the same model, from which field, filters, site and parameters that are held are taken (None: there
-    is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of users (MJD, words).
+    `laws` are the laws of every parameter and candidate (None: absent), `breaks` the breaks that were found, which are
+    laws now. `like` is a calibration of the same model, from which field, filters, site and fixed parameters are taken
+    (None: there is no calibration of a moment). `doubts` are doubts beside χ²; `events` the notes of users (MJD,
+    words).
     """
 
     _first_figure = "tracks"
@@ -83,9 +84,9 @@ class Survey(Drawn):
     def _counts(self) -> tuple[float, int]:
         """χ² of data and priors, and its degrees of freedom.
 
-        These are data less fluxes, plus priors, less the unknowns that these determine. Loose widths only keep the
-        search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
-        determines counts as none, as in a fit (`likelihood.inverses.determined`).
+        Degrees of freedom are data less fluxes, plus priors, less the unknowns that these determine. Weak pulls only
+        keep the search inside and are no knowledge: what they add to χ² is left out, and an unknown that nothing else
+        determines is not counted, as in a fit (`likelihood.inverses.determined`).
         """
         solution, system = self.solution, self.solution.system
         unknowns = [(group.mean, group.precision) for group in (system, *system.cells)]
@@ -193,7 +194,7 @@ class Survey(Drawn):
 
     @property
     def changing(self) -> dict[str, Law]:
-        """The laws other than that of a parameter that all nights share."""
+        """The laws of parameters that not all nights share."""
         by_name = zip(self.data.names, self.laws, strict=True)
         return {name: law for name, law in by_name if law is not None and law.per != ("shared",)}
 
@@ -309,8 +310,8 @@ class Survey(Drawn):
     def tracks(self) -> Any:
         """Every parameter in every night as an astropy table: value and error under its law, and deviation.
 
-        DEVIATION is by how much the parameter would differ in that night, or in nights that a file joins, if it alone
-        were free to differ there, with everything else fitted anew; NaN where its law takes that up.
+        DEVIATION is by how much the parameter would differ in that night, or in the nights that a file joins, if it
+        alone were free to differ there, with everything else fitted anew; NaN where its law takes that up.
         """
         data, solution = self.data, self.solution
         shape, scale = (len(data.nights), len(data.names)), data.equations.scale

@@ -22,10 +22,10 @@ from walop_jax.simulation.observing_plan import ObservingPlan
 class PlannedExposure:
     """One line of a plan: settings, number of exposures, the time (s) of all of them, and their gain.
 
-    `number` is that of the Moon patch or star, −1 through the polariser; `place` that of a star in its raster (None:
-    all). `exptime` (s) is of one exposure, `change` (s) the time until the first can begin. `left_out` is the factor by
-    which the criterion grows without this line, `one_more` the one by which it falls with another exposure. `needed`:
-    a go needs an exposure of it, whatever its gain.
+    `number` is the number of the Moon patch or star, −1 through the polariser; `place` the place of a star in its
+    raster (None: all places). `exptime` (s) is the time of one exposure, `change` (s) the time until the first can
+    begin. `left_out` is the factor by which the criterion grows without this line, `one_more` the factor by which it
+    falls with another exposure. `needed`: a go needs an exposure of this line, whatever its gain.
     """
 
     kind: str
@@ -97,7 +97,9 @@ class ExposurePlan(Displayed):
 
     @property
     def gap(self) -> float:
-        """Proven relative distance of the exposures' variance from the best: that of the criterion of `optimal`."""
+        """Proven relative distance of the variance of the exposures from the best: distance in the criterion of
+        `optimal`.
+        """
         return self.criterion.variance(self.value) / self.criterion.variance(self.bound) - 1.0
 
     @property

@@ -66,10 +66,11 @@ class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
-    are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
-    of these. `truncation` is the highest harmonic of the counts in the angle of the polariser beside their mean: none
-    where the angles at which they were computed are enough. `notes` say what had to be left out. `effects` are those
-    that are to be separated, parameters of the model as well, with whether their size is known.
+    are all parameters of the instruments that were drawn, `prior` is the information on the free parameters beforehand,
+    `names` are the names of these. `truncation` is the highest harmonic of the counts in the angle of the polariser
+    beside their mean: nothing if the angles at which they were computed are enough. `notes` say what had to be left
+    out. `effects` are the effects that are to be separated, which are parameters of the model as well, each with
+    whether its size is known.
     """
 
     available: Available
@@ -166,7 +167,7 @@ def candidates(
 def with_members(
     model: Model, calset: CalibrationSet, given: Sequence[str | Effect]
 ) -> tuple[Model, dict[str, bool]]:
-    """The model with effects at their values, and which of them have one."""
+    """The model with effects at their values, and for each effect whether it has a value."""
     context, stated, extended = effect_context(model.template, calset.exposures), {}, model
     for item in given:
         effect = item
@@ -194,7 +195,7 @@ def with_members(
 
 
 def fewer_points(plan: ObservingPlan) -> tuple[ObservingPlan, Float[np.ndarray, " p"]]:
-    """The same over fewer field points, and for how many of the plan each of them stands; those of stars stay.
+    """The plan over fewer field points, and for how many points of the plan each of them stands; points of stars stay.
 
     Along each axis polynomials of a degree below the number of points have the same sum over both.
     """
@@ -426,7 +427,8 @@ def information_of(
 ) -> Float[np.ndarray, "f f"]:
     """Information of the data of a calibration on parameters by name, beside their priors.
 
-    None on those that it has not, nor on those of `effects` and of the moonlit sky, which is another one next time.
+    It is 0 for parameters that the calibration has not, for parameters of `effects`, and for the moonlit sky, which is
+    another one next time.
     """
     model, without = known.model, {*effects, MoonSky.name}
     shared = [i for i, n in enumerate(names) if n in model.names and model[n].part not in without]

@@ -75,7 +75,7 @@ def _of_the_sky(found: Candidates, planned: Required, had: Sequence[Exposures]) 
 
 
 def _directions(found: Candidates, planned: Required, had: Sequence[Exposures]) -> Required:
-    """One exposure through the polariser in each of so many directions that none are missing."""
+    """Exposures through the polariser in so many directions that a go misses none, one in each."""
     choices_of_clp = {i: choice for i, choice in enumerate(found.choices) if choice.kind == "clp"}
     if not choices_of_clp or found.available.plan.moving or any(e.further for e in had):
         return {}  # which element does the work of the polariser is not known here

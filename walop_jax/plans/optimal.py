@@ -51,10 +51,8 @@ GAP = 0.01  # distance from the bound at which the search ends
 _ROUNDS = 40  # of candidates that join and leave
 _POWERS = (8.0, 40.0, 200.0, 1000.0, 5000.0)  # of the mean that stands for the maximum over targets
 _QUICKLY = 2  # of these powers that have a round each, whatever it brings
-_BETTER, _PATIENCE = (
-    0.02,
-    6,
-)  # of the gap: what brings less is idle; rounds in a row after which the search ends
+_BETTER = 0.02  # of the gap: a round that brings less is idle
+_PATIENCE = 6  # idle rounds in a row after which the search ends
 _STEPS = 300  # of L-BFGS-B in a round
 _SPREAD, _OF_EACH = 96, 3  # candidates that a search begins with: of all families, of each at least
 _TOPS, _OF_FAMILY = 24, 3  # candidates that may join in a round: of all families, of each
@@ -73,7 +71,7 @@ class NotEstimableError(ValueError):
 
 
 class Family(abc.ABC):
-    """Candidates that have something in common, each with its number, an information matrix in every draw, a cost."""
+    """Candidates that have something in common; each has a number, an information matrix in every draw, and a cost."""
 
     cost: Float[np.ndarray, " m"]
 
@@ -86,7 +84,7 @@ class Family(abc.ABC):
         """Σ_r tr G_r M_r of every candidate."""
 
     def between(self, g: InformationMatrices) -> float:
-        """The largest gain for its cost of those that lie between the candidates, where there are such."""
+        """The largest gain for its cost of exposures that lie between the candidates, where there are such."""
         return 0.0
 
 
@@ -174,7 +172,7 @@ class Experiment:
         return shares / np.repeat(total, self.together)[:, None]
 
     def reduced(self) -> Experiment:
-        """The same in coordinates in which the information of everything together is the identity.
+        """The problem in coordinates in which the information of everything together is the identity.
 
         Directions that nothing informs about (gauges) are left out. Raises NotEstimableError if a target needs one.
         """
@@ -251,7 +249,7 @@ class Allocation:
 
 
 class Some:
-    """The problem for a few candidates: their matrices laid out, variances and slopes of them."""
+    """The problem for a few candidates: their matrices laid out, with variances and slopes."""
 
     def __init__(self, experiment: Experiment, keys: Iterable[Key]) -> None:
         self.experiment, self.keys = experiment, list(keys)
@@ -262,7 +260,7 @@ class Some:
         self.columns = q
 
     def with_more(self, keys: Iterable[Key]) -> Some:
-        """The same with further candidates at the end."""
+        """This problem with further candidates at the end."""
         more = [key for key in keys if key not in self.keys]
         if not more:
             return self
@@ -273,7 +271,7 @@ class Some:
         return both
 
     def only(self, which: Sequence[int]) -> Some:
-        """The same with some of the candidates."""
+        """This problem with some of its candidates."""
         some = copy.copy(self)
         some.keys, some.matrices = [self.keys[i] for i in which], self.matrices[:, list(which)]
         some.costs = self.costs[list(which)]
@@ -300,7 +298,9 @@ class Some:
             return np.inf
 
     def near(self, *weights: WeightVector) -> Some:
-        """The same for the targets with the largest variances in some plans: whose value is at most that of all."""
+        """This problem for the targets with the largest variances in some plans: its value is at most that for all
+        targets.
+        """
         relative = np.maximum.reduce([self.experiment.relative(self.variances(weight)) for weight in weights])
         kept = np.argsort(-relative, axis=1)[:, : int((relative >= _NEAR).sum(axis=1).max())]
         some, (r, n, _) = copy.copy(self), self.wide.shape
@@ -346,7 +346,7 @@ class Some:
             total = free.sum()
             value, slope = self.power_mean(each * free / total, power)
             along = each * slope
-            # Shares count by their proportions alone: their sum is held near 1.
+            # Only the proportions of the weights matter: their sum is kept near 1.
             return np.log(value) + 0.5 * (total - 1.0) ** 2, (
                 (along - along @ free / total) / total / value + total - 1.0
             )
@@ -373,7 +373,7 @@ def optimise(
 
 
 def _best(problem: Experiment, gap: float, progress: Callable[[str], None] | None = None) -> Allocation:
-    """As `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
+    """The plan of `optimise`, for a problem in the coordinates of `Experiment.reduced`."""
     some = Some(problem, spread(problem))
     share, level = np.full(len(some.keys), 1.0 / len(some.keys)), 0
     proof, value, weight, at, idle = None, np.inf, share, some, 0

@@ -32,8 +32,8 @@ ENSEMBLES = 2  # the draws are shared out between, since files have chains
 FEWEST = 0.99
 """Fraction of the fits that have to converge."""
 DRAWS_PER_PARAMETER = 5
-"""Draws for each free parameter from which on their covariance takes the place of that of the fit; of fewer than one
-it would be singular."""
+"""Draws for each free parameter from which on the covariance of the draws replaces the covariance of the fit; with
+fewer than one draw it would be singular."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Bootstrap(Sampler):
     repeats_the_fit: ClassVar[bool] = True
 
     def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
-        """Raise TypeError: there is no density that it draws from."""
+        """Raise TypeError: this sampler draws from no density."""
         self._without_chains()
 
     def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
-        """Raise TypeError."""
+        """Raise TypeError: this sampler has no chains."""
         self._without_chains()
 
     def _without_chains(self) -> NoReturn:
@@ -58,7 +58,7 @@ class Bootstrap(Sampler):
 
 
 def simulated_like(result: FitResult, rng: np.random.Generator) -> CalibrationSet:
-    """A set with the rows of that of a fit, whose counts scatter about the model as their errors say.
+    """A set like that of a fit, whose counts scatter about the model as their errors say.
 
     Raises `DataError` for intensities that are no table.
     """

@@ -64,7 +64,7 @@ class Chain:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
 
     def save(self, states: Sequence[EnsembleState], stretches: Sequence[Stretch], seconds: float) -> None:
-        """Write all ensembles with their states at the end, in place of the former ones."""
+        """Write all ensembles, each with its state at the end, in place of what the file held."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
         def fill(file: h5py.File) -> None:

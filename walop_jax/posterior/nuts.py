@@ -33,7 +33,9 @@ FIRST_STEP = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class Nuts(Sampler):
-    """`warm_up` is the number of steps that settle the step size; they are not part of the chain."""
+    """The no-U-turn sampler; `warm_up` is the number of steps that settle the step size, which are not part of the
+    chain.
+    """
 
     warm_up: int = 200
 

@@ -50,10 +50,11 @@ RANKED = 100_000  # positions per quantity that R-hat looks at: sorting more tak
 
 @dataclasses.dataclass(frozen=True)
 class Convergence:
-    """The evidence. `tau` is in steps, per quantity; `history` holds the worst τ after N/4, N/2 and N steps.
+    """Whether chains have converged, and the numbers that say so.
 
-    `steps` are those kept after burn-in, `needed` how many more the rules ask for (0 when converged). Draws that are
-    `independent` by their making have no chain that the rules could judge.
+    `tau` (k) are the autocorrelation times in steps, `history` the worst of them after N/4, N/2 and N steps. `steps` is
+    the number of steps kept after burn-in, `needed` how many more the rules ask for (0 when converged). Draws that are
+    `independent` by their making have no chain to judge.
     """
 
     names: tuple[str, ...]
@@ -77,7 +78,7 @@ class Convergence:
         return self.names[int(np.argmax(self.tau))]
 
     def message(self, seconds_per_step: float = math.nan) -> str:
-        """One sentence for people."""
+        """The result in one sentence."""
         if self.independent:
             drawn = f"{self.ess.min():.0f} independent draws"
             return drawn if self.converged else f"NOT sufficient: {drawn}; {'; '.join(self.reasons)}"
@@ -200,14 +201,15 @@ LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of `sample`. `interval` is the length of a block, which a killed run can lose, in steps; whole blocks
-    are done, so that there are never more steps than `maximum_steps`.
+    """Options of `sample`.
 
-    `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
-    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` are the names of those
-    sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
-    Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
-    exact posterior. Raises ValueError for what makes no sense.
+    `sampler` is a name (`emcee`, `nuts`, `bootstrap`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are
+    options of emcee, where `walkers` 0 stands for twice the number of sampled coefficients, at least 64. `interval` is
+    the length of a block in steps: a killed run loses at most one block; only whole blocks are done, so that there are
+    never more steps than `maximum_steps`. `parameters` are the names of the sampled coefficients (None: the physics
+    coefficients); samplers of the exact posterior sample all, and figures show these. Every `thin`-th step is stored
+    (0: as is usual for the sampler). `checks` is the number of draws compared with the exact posterior. Raises
+    ValueError for values that make no sense.
 
     >>> walop.Options(walkers=128).sampler
     'emcee'
@@ -264,13 +266,13 @@ Report = Callable[[Progress], None]
 class PosteriorSample(Drawn):
     """The posterior of all coefficients.
 
-    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and fixed ones
-    included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
-    figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
-    convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
-    what their spread was made from: the stated errors of the data or, as for the fit, its residuals
-    (`sandwich_adjusted`). `counts` are those of the sampler, `fit` is the `digest_of_fit` of the fit sampled around,
-    `likelihood` that of its data, whose errors were taken times `noise_scale`.
+    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and fixed ones included; `mean` and
+    `covariance` use every kept step. `chains` are the chains of the coefficients `sampled`, which figures show.
+    `accuracy` compares the surrogate with the exact posterior; None where the exact posterior was sampled. `trusted`
+    needs convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from`
+    says what the spread of the draws was made from: the stated errors of the data or, as for the fit, its residuals
+    (`sandwich_adjusted`). `counts` are numbers that the sampler reports, `fit` is the `digest_of_fit` of the fit
+    sampled around, `likelihood` the likelihood of its data, whose errors were taken times `noise_scale`.
     """
 
     _first_figure = "corner"
@@ -309,7 +311,7 @@ class PosteriorSample(Drawn):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict: it is no go where the chains, or the fit that they are around, are not to be trusted."""
+        """The verdict: no go if the chains, or the fit that they are around, are not to be trusted."""
         again = "walop-jax sample RUN --resume goes on, or take fewer coefficients"
         of_fit = "walop-jax diagnose looks for what the fit lacks"
         bad = [] if self.trusted else self.warnings

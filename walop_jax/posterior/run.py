@@ -38,12 +38,11 @@ SAME_FIT = 0.05  # standard errors
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The folder of a run; files are read when they are needed. None stands for files that are missing.
+    """The folder of a run; files are read when they are needed, and a missing file is None.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
-    folder of the run, or beside it).
-
-    Values, covariance, names and `to_table()` are those of its calibration, as of a fit; `posterior` are the draws.
+    folder of the run, or beside it). Values, covariance, names and `to_table()` are taken from its calibration, as of a
+    fit; `posterior` are the draws.
 
     >>> walop.read("RUN")["pupil.magnification"]
     15.6675 ± 0.0051
@@ -81,7 +80,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     @property
     def trusted(self) -> bool:
-        """The verdict on the calibration."""
+        """True if its calibration is to be trusted."""
         return self.required_calibration.verdict.trusted
 
     @functools.cached_property

@@ -83,13 +83,13 @@ class Stretch(NamedTuple):
 
 
 class Sampler(abc.ABC):
-    """A way of drawing from a density.
+    """A way of drawing from a density; `Emcee` is one.
 
-    Without `exact` it is given the surrogate, in which throughput coefficients and catalogue values are marginalised;
-    with it the exact posterior of all free parameters. `software` are the packages whose versions its draws depend on;
-    of its steps every `thin`-th is stored, unless something else is asked for. The chains of emcee are kept, so that an
-    interrupted run `resumes`; those of others start anew. One that `repeats_the_fit` on simulated sets has no density
-    and no chains (`posterior.bootstrap`).
+    A sampler that is not `exact` is given the surrogate, in which throughput coefficients and catalogue values are
+    marginalised; an `exact` one the posterior of all free parameters. `software` are the packages whose versions its
+    draws depend on; every `thin`-th of its steps is stored, unless something else is asked for. A sampler that
+    `resumes` goes on with the chain of an interrupted run; others start anew. One that `repeats_the_fit` on simulated
+    sets has no density and no chains (`posterior.bootstrap`).
 
     The same state and number of steps must always give the same stretch, whatever has been computed before: random
     numbers come from the state.

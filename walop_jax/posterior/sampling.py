@@ -83,7 +83,7 @@ class Ensembles:
         return dict(total)
 
     def go_on(self) -> None:
-        """One more block."""
+        """Compute one more block of steps."""
         began, interval = time.perf_counter(), self.options.interval
         advanced = [self.sampler.advance(self.density, state, interval) for state in self.states]
         stretches = [self._stored(stretch) for _, stretch in advanced]

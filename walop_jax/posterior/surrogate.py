@@ -51,14 +51,13 @@ BENT = 8  # directions that get cubic terms
 
 @dataclasses.dataclass(frozen=True)
 class Surrogate:
-    """Everything needed to evaluate and to draw.
-
-    `scale` is the fitted value of a common scale of the errors, whose ln f is the last sampled coordinate then; None:
-    the errors are as they are.
+    """The surrogate: everything needed to evaluate it and to draw from it.
 
     x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given; `linear`
-    turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for the priors,
-    `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h.
+    turns s into the common eigenvectors of both, with eigenvalues `share` for the data and 1 − `share` for the priors;
+    `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h. `scale` is the
+    fitted value of a common scale of the errors, whose ln f is then the last sampled coordinate; None: the errors are
+    as they are.
     """
 
     names: tuple[str, ...]
@@ -154,7 +153,7 @@ class Surrogate:
         return self.place(z, s)
 
     def place(self, z: Draws, s: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n f"]:
-        """Free parameters at given coordinates."""
+        """Free parameters (n, f) at given coordinates z and s."""
         return self.centre + z[:, : self.along.shape[1]] @ self.along.T + s @ self.across.T
 
     def moments(self, z: Draws) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:

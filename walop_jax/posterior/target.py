@@ -43,7 +43,7 @@ def ln_scale_unit(measured: int) -> float:
 
 
 class Target:
-    """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
+    """−2 ln posterior of a fitted model as a function of its free parameters x (f), around the fit at `centre`."""
 
     def __init__(self, result: FitResult) -> None:
         self.likelihood, self._near = result.likelihood, result.expansion
@@ -60,12 +60,14 @@ class Target:
 
     @property
     def scale(self) -> FreeValues:
-        """A typical step of each free parameter (its prior width, or what preconditions the solver)."""
+        """A typical step (f) of each free parameter: the natural step of the solver."""
         return np.array([self.model.parameters[i].scale for i in self.free])
 
     @property
     def measured(self) -> int:
-        """Independent data of all used rows: an intensity for each camera, less its part of the unknown fluxes."""
+        """Independent data of all used rows: an intensity for each camera, less the fraction of the unknown fluxes of
+        the row.
+        """
         return round(float(self.likelihood.used.sum(axis=0) @ self.likelihood.data_per_row))
 
     @property

@@ -50,7 +50,7 @@ _LISTED = 12  # numbers of a parameter that are listed
 
 
 class Simulated(NamedTuple):
-    """A synthetic calibration set and the instrument that made it."""
+    """A synthetic calibration set and the true instrument that made it."""
 
     calset: CalibrationSet
     truth: Instrument
@@ -267,7 +267,7 @@ def true_instrument(
     catalogue_seed: int | None = None,
     catalogue: Sources | None = None,
 ) -> tuple[Sources, Instrument]:
-    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    """The catalogue of standards and the true instrument that `simulate` uses for the same arguments."""
     build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
     if catalogue_seed is not None:
         stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
@@ -312,9 +312,9 @@ def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: in
 
 
 def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
-    """Flux of every (point, exposure): transparency, illumination of the field, brightness of the stars.
+    """Flux (p, e) of every point and exposure: transparency, illumination of the field, brightness of the stars.
 
-    A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all are at their means.
+    A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all factors are at their means.
     """
     used, source = plan.layout()
     exposures = plan.exposures()

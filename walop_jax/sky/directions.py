@@ -71,9 +71,9 @@ def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.nda
 
 
 def galactic(ra: Vector, dec: Vector) -> tuple[Vector, Vector, Vector]:
-    """Galactic longitude and latitude of directions, and the position angle of Galactic north there (deg).
+    """Galactic longitude and latitude of directions, and the position angle of Galactic north there (all in deg).
 
-    A position angle from Galactic north is that from equatorial north less the last one.
+    A position angle from Galactic north is the angle from equatorial north less the position angle of Galactic north.
     """
     stars: Any = _directions(ra, dec)
     pole: Any = SkyCoord(0.0, 90.0, unit="deg", frame="galactic")
@@ -100,7 +100,9 @@ def designations(ra: Vector, dec: Vector) -> np.ndarray:
 
 
 def same_stars(ra: Vector, dec: Vector, tolerance: float) -> Int[np.ndarray, " n"]:
-    """The number of the star of every position (deg): chains of those within a tolerance (arcsec) are one star."""
+    """The number of the star of every position (deg): positions chained by steps within a tolerance (arcsec) are one
+    star.
+    """
     stars = _directions(ra, dec)
     first, second, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
     pairs = coo_array((np.ones(len(first)), (first, second)), shape=(len(ra), len(ra)))
@@ -142,10 +144,10 @@ def registered(
     of_reference: Float[np.ndarray, " m"],
     tolerance: float,
 ) -> Registration:
-    """The shift and rotation of positions (deg, on the tangent plane) against others of the same stars.
+    """The shift and rotation of positions (deg, on the tangent plane) against reference positions of the same stars.
 
-    Differences of all pairs of bright stars within `REACH` have a peak at the shift; the pairs there give shift and
-    rotation by least squares, each round with those that are closer. No peak above chance: `pairs` is 0.
+    Differences of all pairs of bright stars within `REACH` have a peak at the shift. The pairs in the peak give shift
+    and rotation by least squares; each round takes the pairs that are closer. Without a peak above chance `pairs` is 0.
     """
     bright = place[np.argsort(-brightness, kind="stable")[:BRIGHTEST]]
     bright_reference = reference[np.argsort(-of_reference, kind="stable")[:BRIGHTEST]]
@@ -182,10 +184,10 @@ def registered(
 def mutual(
     place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "m 2"], tolerance: float
 ) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Pairs of positions (deg, within a few degrees of the origin) that are nearest to each other within a tolerance.
+    """Pairs of positions (deg, near the origin) that are each other's nearest, within a tolerance (arcsec).
 
-    The tolerance is in arcsec. First comes which positions are ambiguous, a second one of the reference being within it
-    as well; then the pairs, by their numbers in the two lists.
+    Returned are: True for positions that are ambiguous, as a second one of the reference lies within the tolerance as
+    well; then the pairs, by their numbers in the two lists.
     """
     if not len(place) or not len(reference):
         return np.zeros(len(place), bool), np.zeros(0, int), np.zeros(0, int)

@@ -13,7 +13,7 @@ tan(position angle) = b / a, so that
 which needs no angle and stays smooth at γ = 0. All functions here give δ = 1; δ is a parameter of the fit.
 
 North and east at a field point are those of the field centre, carried there by the smallest rotation
-(the meridian convergence is thereby taken out), in the words of the instrument frame:
+(the meridian convergence is thereby taken out), as in the definition of the instrument frame:
 
     n(k) = n − (k·n) / (1 + k·c) · (k + c).
 """
@@ -68,7 +68,7 @@ class SkyOfExposures:
 
 @functools.lru_cache(maxsize=32)
 def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[OfExposures, OfExposures]:
-    """Direction of the Moon, kept: the same set is brought together with many models."""
+    """Direction of the Moon, kept for the next call: one set is often combined with many models."""
     return body_direction("moon", np.array(mjd), site) if mjd else (np.zeros(0), np.zeros(0))
 
 
