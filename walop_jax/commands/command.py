@@ -195,12 +195,13 @@ def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object
 class Outcome(Generic[T]):
     """Result of a command: `value` for Python, and the output of the program.
 
-    `document` is plain data (None: that of the value), to which `extra` is added; `display` is shown on a terminal
-    (None: that of the value), with the text `below` it; `text` is printed in its place. `files` are texts of files of
-    the output folder, or write them, each given its path; the document is written as the file `saved_as`, with the
-    display; the files `drop` go then. `warnings` are sentences to bear in mind. `failure` is the error (exit code 1),
-    `trusted` whether the result can be used (exit code 3 if not). `next` are command lines that one might want to type
-    next (`typed`; empty ones are left out). `markdown`: the text is laid out on a terminal.
+    `document` is plain data (None: the document of the value), to which `extra` is added; `display` is shown on a
+    terminal (None: the display of the value), with the text `below` it; `text` is printed in place of both. `files` are
+    the files of the output folder by name: a text, or a function that writes the file at a path. The document is
+    written as the file `saved_as`, together with the display; the files `drop` are removed then. `warnings` are
+    sentences to bear in mind. `failure` is the error (exit code 1), `trusted` whether the result can be used (exit code
+    3 if not). `next` are command lines that one might want to type next (`typed`; empty ones are left out). `markdown`:
+    the text is laid out on a terminal.
     """
 
     value: T
@@ -268,7 +269,7 @@ IN_PYTHON = {
     "progress": "Called with a line of text about each step; print, for example.",
     "seed": "Seed of random numbers.",
 }
-"""What these are, for `help`."""
+"""Lines about these parameters, for `help`."""
 
 NUMBERS = ("bool", "int", "int | None", "float", "float | None")  # annotations of parameters that are no text
 
@@ -281,13 +282,13 @@ IN_THE_MODEL = "that is a matter of the model: model=base_model(calset).change('
 class Command(Generic[T]):
     """A command: `function` is the Python function, `run` the call of the program.
 
-    `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
+    `stages` are the stages that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" or "table" if `output` is a single one; () if the body looks after its outputs itself. `random`: its seed
     matters. `jax`: it computes. `outputs` are the arguments that name what is written. `elements`: it takes kinds of
-    elements of one's own, as commands with `effects` do.
-    `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
-    share. `options` are those of its own arguments by name; beside those that are given it has those of `SHARED`.
-    `described` are all that it might have.
+    elements of a user's own, as commands with `effects` do. `signature` is the signature of the Python function: the
+    arguments of the body, with their types spelt out, then the arguments that all commands have. `options` are the
+    options of the arguments of the body by name: those that are given, and those of `SHARED`. `described` are all
+    options that it might have.
     """
 
     body: Callable[..., Outcome[T]]
@@ -429,7 +430,7 @@ class Command(Generic[T]):
 
 
 def _paths_in(given: Any) -> list[PathLike]:
-    """The paths that an argument consists of: one, or those in a list; of a run its folder."""
+    """The paths that an argument consists of: one, or those of a list; for a run the path of its folder."""
     entries = (getattr(entry, "folder", entry) for entry in several(given))
     return [entry for entry in entries if isinstance(entry, str | os.PathLike)]
 

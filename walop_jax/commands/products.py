@@ -53,7 +53,10 @@ def path_of(given: Any, what: str, advice: str) -> Path:
 
 
 def fit_of(given: Any) -> Any:
-    """The last fit of a diagnosis, whose calibration is that of the diagnosis; anything else as it is."""
+    """The last fit of a diagnosis; anything else as it is.
+
+    The calibration of that fit is the calibration of the diagnosis.
+    """
     after = getattr(given, "after", None)
     return after if isinstance(after, Fitted) else given
 

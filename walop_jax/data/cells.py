@@ -8,8 +8,8 @@ Surface     Frames are cut into blocks. To the pixels of a block a surface is fi
             polynomial, the largest of those left out, is zero there. A mean over a cell, taken for the value at its
             middle, is off by side²/24 · ∇²; these values by the eighth power of the side of a block.
 Light       Fitted are fractions N_k/L of the light L = Σ_k N_k of a pixel, and N_k = fraction · (surface of L) at the
-            points: what the cameras have in common, such as the illumination of the field, may be as rough as it likes. Of
-            photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
+            points: what the cameras have in common, such as the illumination of the field, may be as rough as it likes.
+            Of photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
             faint, L = 1, and the surface is that of the counts themselves.
 Weights     N_ERR of the pixels is made from their counts: weights 1/σ² would favour pixels that happen to be faint. All
             have the same weight, in all cameras, so that errors are Σσ² of all, propagated.

@@ -156,7 +156,7 @@ def with_candidates(
 
 
 def model_hash(model: Model) -> str:
-    """A hash of all that nights must have in common: instrument, physics, effects, ties and values of fixed parameters."""
+    """A hash of what all nights must have in common: instrument, physics, effects, ties, fixed values."""
     header = header_of(model)
     fixed = (p for p in model.parameters if (p.tie or not p.free) and p.part not in SKY_AND_STARS)
     held = [f"{p.name} {p.tie or repr(p.start)}" for p in fixed]

@@ -47,11 +47,11 @@ LINES = 81  # wavelengths across the filter
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """Origin of Δq, Δu, point by point.
+    """Where Δq and Δu of Paper II come from, point by point (p, 2).
 
-    `found` as in the paper; `along` what the coefficients' departure along the weakest direction of the design
-    matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` Δ of a fit to noise-free
-    polarised states; `anchored` Δ when one unpolarised exposure is added to those of the set.
+    `found` are Δq, Δu as in the paper; `along` is what the departure of the coefficients along the weakest direction of
+    the design matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` is Δ of a fit to
+    noise-free polarised states; `anchored` is Δ when one unpolarised exposure is added to the exposures of the set.
     """
 
     found: Float[np.ndarray, "p 2"]
@@ -120,8 +120,8 @@ def offsets(
 class Comparison(Drawn):
     """Paper II's method and the joint model on one calibration set.
 
-    `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
-    whether the joint model was held against a truth there (its covariance otherwise).
+    `grid` has the errors at the points that the polynomials were made for, `between` the errors elsewhere; `truth` says
+    whether the joint model was compared with a truth there (with its covariance otherwise).
     """
 
     _first_figure = "histogram"

@@ -33,7 +33,9 @@ RELEVANT = 1e-4  # of the largest change of a matrix: the scale of no map is sma
 def residuals_figure(
     likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
-    """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
+    """Residuals of every field point before and after a fit (full vectors of parameters), and a histogram of those
+    after it.
+    """
     figure, ((left, middle, right),) = on.panels(9.6, 3.0, 1, 3, least=1.6)
     _before_and_after((left, middle), likelihood, before, values)
     middle.set_ylabel("")
@@ -145,7 +147,9 @@ def modulation_figure(
 
 @styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
-    """The elements of the matrix over the field; `kind`: those of one name in Paper II (place in `PAPER_NAMES`)."""
+    """The elements of the matrix over the field; with `kind` only the elements of one name in Paper II (index in
+    `PAPER_NAMES`).
+    """
     chosen = [i for i in range(len(maps.values)) if kind in (None, style.element_kind(i, maps.arms))]
     if not chosen:
         what = f"no element of the matrix of {maps.arms} arms is {style.PAPER_NAMES[kind or 0]}"
@@ -176,9 +180,10 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """Change of the matrix over the field (%), a scale for each element; ValueError for maps of other places.
+    """Change of the matrix over the field (%), with a scale for each element.
 
-    A scale that two elements share would show nothing of the smaller one.
+    A scale that two elements share would show nothing of the smaller one. Raises ValueError for maps of different
+    places.
     """
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")

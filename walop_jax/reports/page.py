@@ -74,7 +74,7 @@ class Page(Displayed):
     missing: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The page's path, length and missing files as plain data."""
         return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
 
     def display(self) -> Display:
@@ -83,7 +83,7 @@ class Page(Displayed):
 
 
 class Picture(NamedTuple):
-    """An image as a data URI, its caption, whether it takes half of the width; the same image for a narrow screen."""
+    """An image as a data URI, its caption, whether it takes half of the width; `narrow` is it for a narrow screen."""
 
     source: str
     caption: str

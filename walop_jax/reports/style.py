@@ -279,7 +279,7 @@ def error_map(axis: Axes, title: str, x: OfPoints, y: OfPoints, percent: OfPoint
 
 
 def nearest_apart(x: OfPoints, y: OfPoints) -> OfPoints:
-    """Distance of each point from the next at another place, the larger of those along X and Y.
+    """Distance of each point from the next point at another place: the larger of the distances along X and Y.
 
     Squares with these sides do not overlap. Infinite for a point that is alone.
     """
@@ -301,9 +301,10 @@ def _spacing(x: OfPoints, y: OfPoints) -> float:
 
 
 def colour_bar(image: Any, label: str = "", axes: Any = None, **options: Any) -> Any:
-    """A colour bar with small numbers, plain ones on a logarithmic scale: of all `axes`, or of a map, in its height.
+    """A colour bar with small numbers, plain ones on a logarithmic scale: for all `axes`, or for one map, in its
+    height.
 
-    In a column of print that of a map has three numbers at most: there is no room for 99.95 beside the next.
+    In a column of print the bar of one map has three numbers at most: there is no room for 99.95 beside the next.
     """
     figure = image.axes.figure
     place = (
@@ -390,7 +391,8 @@ def rounded_up(value: float) -> float:
 # ------------------------------------------------------------------------------------------ the instrument matrix
 
 PAPER_NAMES = ("zero offset", "efficiency", "cross-talk")
-"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
+"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; of the arm that measures u: m31, m33,
+m32."""
 
 
 def element_symbols(arms: int) -> tuple[str, ...]:
@@ -399,7 +401,7 @@ def element_symbols(arms: int) -> tuple[str, ...]:
 
 
 def element_kind(element: int, arms: int) -> int:
-    """Place in `PAPER_NAMES` of an element of the matrix; with a single arm nothing is the cross-talk of another."""
+    """Index in `PAPER_NAMES` of an element of the matrix; with a single arm no element is the cross-talk of another."""
     arm, column = divmod(element, 3)
     if column == 0 or arms != 2:
         return min(column, 1)
