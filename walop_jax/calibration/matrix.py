@@ -81,7 +81,7 @@ class MatrixMaps:
 
     @property
     def arms(self) -> int:
-        """Number of arms."""
+        """Number of arms of the instrument, three maps for each."""
         return len(self.values) // 3
 
     @property
@@ -114,12 +114,12 @@ class ResidualMap:
 
     @property
     def arms(self) -> int:
-        """Number of arms."""
+        """Number of arms of the instrument."""
         return (len(self.values) + 1) // 4
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the quantities."""
+        """Names of the planes, as `residual_names` gives them."""
         return residual_names(self.arms)
 
     def excess(self) -> dict[str, float]:

@@ -428,7 +428,7 @@ class _Reader:
         return _number(self.header, name, self.primary, missing)
 
     def flag(self, name: str) -> bool:
-        """T or F."""
+        """A truth value of the header: True for T, False for F."""
         value = self.header.get(name)
         if not isinstance(value, bool):
             raise self.primary.fail(f"is {value!r}, not T or F", name, _AGAIN)

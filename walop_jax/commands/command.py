@@ -222,7 +222,7 @@ class Outcome(Generic[T]):
 
     @functools.cached_property
     def content(self) -> Any:
-        """The document, made once."""
+        """The document as plain data, with `extra` added; made once."""
         value: Any = self.value
         plain = value.document() if self.document is None else self.document
         return {**plain, **self.extra} if self.extra else plain

@@ -114,7 +114,7 @@ def plot(
 
 
 def _inches(width: float | str | None) -> float | None:
-    """A width in inches."""
+    """The width in inches of a width in mm, or of "column" or "page"."""
     from walop_jax.reports.style import WIDTHS
 
     if width is None:

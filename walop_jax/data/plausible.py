@@ -49,7 +49,7 @@ class Implausible(NamedTuple):
 
 
 def today() -> float:
-    """The MJD of now."""
+    """The present moment as MJD (UTC)."""
     return time.time() / 86400.0 + 40587.0
 
 

@@ -497,7 +497,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """Summary of the observations."""
+        """What was observed: exposures by KIND, field points, standards, filters, remarks."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         x, y = (f"{values.min():+.3f} … {values.max():+.3f}°" for values in (points.x, points.y))

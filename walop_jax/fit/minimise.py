@@ -56,21 +56,21 @@ BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 @runtime_checkable
 class Quadratic(Protocol):
-    """Value, and half the gradient and Hessian, of the objective, at one place."""
+    """The objective at one place: its value, and half its gradient and Hessian there."""
 
     @property
     def objective(self) -> float:
-        """Value to be minimised."""
+        """The value to be minimised."""
         ...
 
     @property
     def gradient(self) -> Vector:
-        """Half the gradient."""
+        """Half the gradient (n) of the objective."""
         ...
 
     @property
     def matrix(self) -> Matrix:
-        """Half the Gauss–Newton Hessian."""
+        """Half the Gauss–Newton Hessian (n, n) of the objective."""
         ...
 
 

@@ -69,7 +69,7 @@ class ModelFile(Displayed):
     path: Path | None
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The model file as plain data, for `--json`."""
         keys, model = ("start", "unit", "prior", "free", "tie", "about"), self.model
         document = {"instrument": model.name, "effects": list(model.effect_names)}
         document |= {"output": None if self.path is None else str(self.path)}

@@ -102,7 +102,7 @@ class Layout:
 
     @property
     def batches(self) -> int:
-        """Number of batches."""
+        """Number of batches of field points, the last one filled up."""
         return -(-self.points // self.batch)
 
     @property

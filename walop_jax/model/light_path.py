@@ -113,7 +113,7 @@ class LightPath(Component):
 
     @property
     def standard(self) -> Standards:
-        """The standard stars."""
+        """The source `standard` of the light path: its standard stars."""
         source = _member(self.sources, Standards.name, "source")
         assert isinstance(source, Standards)
         return source

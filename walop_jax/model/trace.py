@@ -29,7 +29,9 @@ STOKES = ("I", "Q", "U", "V")
 
 @dataclasses.dataclass(frozen=True)
 class LightStage:
-    """The light at one place: rows of `value` are one beam or the arms, columns Stokes or cameras."""
+    """The light at one place of its path: rows of `value` are one beam or the arms, columns Stokes parameters or
+    cameras.
+    """
 
     name: str
     about: str
@@ -42,9 +44,9 @@ class LightStage:
 class Sightline:
     """A source and its path through the instrument; angles and field coordinates in degrees.
 
-    `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0); `clp_angle` is
-    NaN where the polariser is out; `setting` is a single row: the colour of the source, and the positions of the
-    optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
+    `q`, `u` are the Stokes parameters of the source in the instrument frame (taken as catalogue values at ROTATOR 0);
+    `clp_angle` is NaN where the polariser is out; `setting` is a single row: the colour of the source, and the
+    positions of the optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
     """
 
     x: float = 0.0

@@ -103,7 +103,7 @@ def at_solution(data: Together, solution: Solution, entry: Break) -> Break:
 
 
 def with_breaks(data: Together, laws: LawOfEach, breaks: Sequence[Break]) -> tuple[Law | None, ...]:
-    """Laws with breaks."""
+    """The laws with each of the breaks added to the law of its parameter."""
     changed = list(laws)
     for entry in breaks:
         i = data.names.index(entry.name)

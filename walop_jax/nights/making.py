@@ -52,7 +52,7 @@ class Data(NamedTuple):
     model: Model | None = None
 
     def read(self) -> CalibrationSet:
-        """The set."""
+        """The calibration set, read if it is a file."""
         if isinstance(self.source, CalibrationSet):
             return self.source
         return self.source.calset if isinstance(self.source, Run) else read_calibration_set(self.source)

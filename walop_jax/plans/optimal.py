@@ -133,7 +133,7 @@ class Experiment:
         return 1 if self.blocks is None else len(self.blocks)
 
     def cost(self, weights: Weights) -> float:
-        """Σ c w."""
+        """The cost Σ c w of a plan, in the unit of the budget."""
         return sum(weight * float(self.families[f].cost[i]) for (f, i), weight in weights.items())
 
     def information(self, keys: Sequence[Key]) -> Float[np.ndarray, "r s n n"]:
@@ -278,13 +278,13 @@ class Some:
         return some
 
     def covariance(self, weight: WeightVector) -> InformationMatrices:
-        """M(w)⁻¹ of every draw."""
+        """M(w)⁻¹ of every draw (r, n, n), for the weights of the candidates."""
         r, s, n, _ = self.matrices.shape
         information = self.experiment.known + (weight @ self.matrices.reshape(r, s, -1)).reshape(r, n, n)
         return np.linalg.inv(0.5 * (information + np.swapaxes(information, 1, 2)))
 
     def variances(self, weight: WeightVector) -> OfTargets:
-        """φ of every target."""
+        """The variances φ of every target (draw, target)."""
         return self._by_target(self.wide * (self.covariance(weight) @ self.wide))
 
     def _by_target(self, products: Float[np.ndarray, "r n kq"]) -> OfTargets:

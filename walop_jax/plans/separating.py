@@ -62,7 +62,7 @@ class Pair(NamedTuple):
     after: float
 
     def in_words(self) -> str:
-        """One sentence."""
+        """A sentence on how well the pair is separated."""
         excluded = "excluded" if self.after >= DECIDED else "not excluded"
         return f"if {self.truth} is true, {self.rival} is {excluded}: Δχ² {self.after:.3g} (now {self.before:.2g})"
 

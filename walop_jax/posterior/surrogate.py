@@ -88,11 +88,11 @@ class Surrogate:
         return self.scale * np.exp(ln_scale_unit(self.measured) * z[..., -1])
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
-        """1/f² of every draw."""
+        """1/f² of every draw (n), f the factor on the errors."""
         return (self.scales(z) / (self.scale or 1.0)) ** -2
 
     def features(self, z: Draws) -> Float[np.ndarray, "n h"]:
-        """h for every draw."""
+        """The features h (n, h) of the equations in the head of this file, for every draw."""
         return np.asarray(features_of(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
 
     def density(self) -> Density:

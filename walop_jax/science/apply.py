@@ -64,14 +64,15 @@ ROUGH = 0.005
 class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
-    On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
-    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
-    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since the calibration
-    that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
-    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single error that
-    the data of the calibration would not have shown (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts
-    the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of the sky left
-    over that they do not exclude (None: the level of the sky is not stated).
+    They are on the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere.
+    `covariance` is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum` and
+    `changed`: `spectrum` is the error of a TEFF or, for a star without one, the spread of colours of a population
+    (`COOL`, `HOT`), and `changed` comes from changes since the calibration that the whole catalogue shows. `colour` is
+    the error of (q, u) if TEFF were ignored; without TEFF, half the difference between stars of 3500 K and 10 000 K.
+    `hidden` is the largest shift of q and u by a single error that the data of the calibration would not have shown
+    (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts the rows of a star. `check` is the check of all
+    stars together, `sky_bound` the largest shift by leftover light of the sky that the stars do not exclude (None: the
+    level of the sky is not stated).
     """
 
     qu: QuOfStars

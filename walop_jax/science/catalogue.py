@@ -35,12 +35,12 @@ class Catalogue:
     """The rows of a science catalogue.
 
     `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
-    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
-    those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
-    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level subtracted
-    (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
-    `remarks` name oddities of the table, and unused columns; `doubts` are about all of it: its results are not to be
-    trusted.
+    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged; `copy`
+    marks rows that repeat another row of their star to the last bit, which are not used, and `repeated` rows with the
+    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level that was
+    subtracted (None: not stated); `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] NaN where
+    it is not known. `remarks` name oddities of the table, and unused columns; `doubts` concern the whole catalogue,
+    whose results are then not to be trusted.
     """
 
     points: FieldPoints

@@ -102,7 +102,7 @@ class Certificate(Displayed):
         return (*self.verdict.doubts, *checks)
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Checks and requirements as plain data, the part `commissioning` of check.json."""
         return {
             "product": str(self.path),
             "go": self.go,

@@ -83,7 +83,8 @@ class MovedParameter:
 
 @dataclasses.dataclass(frozen=True)
 class LargestChange:
-    """The parameter whose change stands out most, `z` standard errors of it, of so many changes that were `asked` for.
+    """The parameter whose change stands out most, by `z` standard errors, among the `asked` changes that were asked
+    for.
 
     `alone` says that `size` is the change of this parameter with all others as they were. `p_value` is corrected for
     the number of changes.
@@ -149,7 +150,7 @@ class Epoch(Displayed):
 
     @property
     def verdict(self) -> str:
-        """The verdict in words."""
+        """The answer in words: unchanged, changed, or not known."""
         if self.fits is None:
             return "The new data are not explained"
         return "The old calibration still fits" if self.fits else "The instrument has changed"
@@ -182,7 +183,7 @@ class Epoch(Displayed):
         return f"off by {two_digits(errors['median'])} % (median; {most} % at most) if the new data are right"
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The comparison as plain data, the part `epoch` of check.json."""
         return {"verdict": self.verdict} | dataclasses.asdict(self)
 
     def to_table(self) -> Any:
@@ -337,7 +338,7 @@ def compared(
 ) -> tuple[float, int, LargestChange]:
     """Δᵀ V⁻¹ Δ, the number of directions that were measured, and the largest change of a single parameter.
 
-    Every parameter counts by itself and as if nothing else had changed; those of `sigma` 0 are not known.
+    Every parameter is asked by itself and as if nothing else had changed; parameters with `sigma` 0 are not known.
     """
     measured = np.flatnonzero(sigma > 0)
     unit = sigma[measured]

@@ -39,12 +39,12 @@ Rows3 = Float[np.ndarray, "r 3"]
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """(q, u) of every star, NaN where its rows do not hold both.
+    """(q, u) of every star (s), NaN where its rows do not hold both.
 
-    `photon` is the covariance from the noise of the counts; `condition` the square root of the condition
-    number of the information (1: q and u equally well known); `chi2` and `dof` of the star's rows, `flux` F (in
-    counts of unpolarised light at unit throughput) of every camera and `gain` of every row:
-    δ(q, u) = −Σ gain · δ(model / F).
+    `photon` is the covariance from the noise of the counts; `condition` the square root of the condition number of the
+    information (1: q and u equally well known); `chi2` and `dof` belong to the rows of a star, `flux` F (in counts of
+    unpolarised light at unit throughput) to every row and camera, `gain` to every row: δ(q, u) = −Σ gain · δ(model /
+    F).
     """
 
     qu: Float[np.ndarray, "s 2"]

@@ -82,7 +82,7 @@ class FieldAccuracy:
 
     @property
     def reached(self) -> float:
-        """The error of p that `SHARE` of the field stays below, of that where one exposure measures u."""
+        """The error of p that the fraction `SHARE` stays below, of the field where one exposure measures u."""
         return reached(self.error if self.with_u is None else self.error[self.with_u])
 
     @property
@@ -138,7 +138,7 @@ class FieldAccuracy:
 
     @property
     def median(self) -> float:
-        """Median over the field."""
+        """Median over the field of the error of p, a fraction."""
         return float(np.median(self.error))
 
     def document(self) -> dict[str, object]:
@@ -207,7 +207,7 @@ class Requirement:
 
     @property
     def doubt(self) -> Doubt:
-        """The reason that it is where it is not met."""
+        """The doubt that it is if it is not met."""
         return Doubt(Quality(0), self.found, blocking=self.needed, off=self.off, remedy=self.advice)
 
 
@@ -247,11 +247,11 @@ def for_stars(
     *,
     complete: bool = True,
 ) -> Verdict:
-    """The verdict on a calibration for stars: that on its fit, with what it lacks for their accuracy.
+    """The verdict on a calibration for stars: the verdict on its fit, with what it lacks for their accuracy.
 
-    `accuracy` is that of p over the field (None: not asked), `findings` are those of `inspect` about its data. The
-    accuracy of a fit that is not trusted, or not `complete`, is not known: it is no reason for anything. Notes are none
-    either.
+    `accuracy` is the accuracy of p over the field (None: not asked), `findings` are the findings of `inspect` about its
+    data. The accuracy of a fit that is not trusted, or not `complete`, is not known, and no reason for anything; nor
+    are notes.
     """
     doubts = [
         Doubt(Quality(0), finding.what, blocking=finding.severity == "fault", remedy=finding.advice)

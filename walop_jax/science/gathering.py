@@ -56,10 +56,10 @@ class Gathered:
 
 
 def pointing_of(catalogues: Catalogues, given: dict[str, float | None]) -> tuple[Pointing, list[str]]:
-    """The pointing, as given, of the headers, or of the WCS of an image, with remarks.
+    """The pointing, as given, or from the headers, or from the WCS of an image; with remarks.
 
-    One that contradicts the WCS beside it is remarked on. Raises `DataError` where it is nowhere, for headers that
-    contradict each other, and for angles (deg) that cannot be meant.
+    A pointing that contradicts the WCS beside it is remarked on. Raises `DataError` where there is none, for headers
+    that contradict each other, and for angles (deg) that cannot be meant.
     """
     first, remarks = catalogues[0], []
     needed = [name for name, value in given.items() if value is None]
@@ -151,9 +151,9 @@ def instrument_of(catalogues: Catalogues, asked: str) -> tuple[str, list[str]]:
 def gather(
     catalogues: Catalogues, names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
 ) -> Gathered:
-    """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
+    """One catalogue of the stars of all cameras; `names` are the names of the cameras, `tolerance` is in arcsec.
 
-    Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
+    Raises `DataError` for catalogues of different fields, and for catalogues with too few stars in common.
     """
     if len(fluxes := {camera.flux_name: camera for camera in catalogues}) > 1:
         what = " and ".join(f"{name} ({camera.path})" for name, camera in fluxes.items())

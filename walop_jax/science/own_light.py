@@ -83,7 +83,7 @@ class OwnLight:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)))
 
     def of(self, chosen: Bool[np.ndarray, " s"]) -> OwnLight:
-        """Some of the stars."""
+        """The records of some of the stars."""
         return OwnLight(*(getattr(self, f.name)[chosen] for f in dataclasses.fields(self)))
 
 
@@ -104,7 +104,7 @@ class ArmChange(NamedTuple):
         return float(np.copysign(alarms.threshold(max(self.chance, 1e-300)), self.size))
 
     def words(self) -> str:
-        """The change in words."""
+        """The change in words: which camera is brighter, by how much, and how sure that is."""
         first, second = self.cameras
         size = with_error(100 * abs(self.size), 100 * self.error)
         return f"{first} {('brighter', 'fainter')[self.size < 0]} by {size} % against {second}"
@@ -148,7 +148,7 @@ class OwnLightCheck:
         return f"{what}, {abs(best.sigma):.0f} σ: as if {some([c.words() for c in self.alike], 4, ' or ')}"
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The check as plain data."""
         return {
             "found": self.found,
             "stars": self.stars,

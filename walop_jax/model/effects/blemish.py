@@ -69,7 +69,7 @@ class Blemish(Effect):
     x: Scalar = param("deg", "centre along X", SOURCE, scale=0.02, loose=1.0, default=0.0)
     y: Scalar = param("deg", "centre along Y", SOURCE, scale=0.02, loose=1.0, default=0.0)
     size: Scalar = param("deg", "standard deviation of the spot", SOURCE, scale=0.02, loose=0.5, default=0.05)
-    depth: Scalar = param("", "share that is missing", SOURCE, width=0.02, default=0.0)
+    depth: Scalar = param("", "fraction that is missing", SOURCE, width=0.02, default=0.0)
     camera: int = eqx.field(static=True, default=0)
 
     name: ClassVar[str] = "blemish"

@@ -81,10 +81,11 @@ class Combinations(NamedTuple):
 
 
 class Grows(NamedTuple):
-    """Dependences allowed in a change (`Factor.depends_on`), on which `angle`, and combinations `tried` in a diagnosis.
+    """What a change may grow with: dependences (`Factor.depends_on`), an angle, and the combinations `tried` in a
+    diagnosis.
 
-    `angle` is the prefix of the columns of one element; None: any element, and also single exposures and those of a
-    KIND.
+    `angle` is the prefix of the columns of the one element whose angle is allowed; None: any element, and also single
+    exposures and exposures of one KIND.
     """
 
     allowed: tuple[str, ...] = ()
@@ -93,7 +94,7 @@ class Grows(NamedTuple):
 
 
 class NoSlotError(ValueError):
-    """A change without a sum of slots to first order: it needs its own derivative."""
+    """A change that is no sum of slots to first order, so that it needs a derivative of its own."""
 
 
 class SlotTerm(NamedTuple):
@@ -118,9 +119,9 @@ def itself(stage: str) -> SlotTerms:
 class ChangeKind:
     """A kind of change: one of `AMPLITUDES`, its patch of an instrument, the observation that would test it.
 
-    Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise
-    `NoSuchPlaceError` where an instrument has no such place, ValueError for an impossible change. `slots` are its
-    first-order terms; slots beyond an instrument are no error here.
+    Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise `NoSuchPlaceError` where
+    an instrument has no such place, ValueError for an impossible change. `slots` are its first-order terms; slots that
+    an instrument does not have are no error here. The kind `gain`, for instance, multiplies the counts of a camera.
     """
 
     parameter: str
@@ -139,9 +140,11 @@ KINDS: dict[str, ChangeKind] = {}
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A kind at a place with its factors; `origin` is the origin of its light: another camera, or `OPPOSITE`.
+    """A change: a kind, at a place, with factors; `origin` is where its light comes from: another camera, or
+    `OPPOSITE`.
 
-    Factors are counted in the `units` of an instrument: those of WALOP until it is `counted_in` those of another.
+    Factors are counted in the `units` of an instrument, those of WALOP until the change is `counted_in` other units.
+    `Change.parsed("gain of O1 * hours")` has the kind "gain", the relation "of", the place "O1" and one factor.
     """
 
     kind: str
@@ -164,7 +167,7 @@ class Change:
 
     @property
     def label(self) -> str:
-        """The same without blanks, for the name of a parameter."""
+        """The text of the change without blanks, for the name of a parameter."""
         return self.text.replace(" ", "_")
 
     @property
@@ -174,16 +177,16 @@ class Change:
 
     @property
     def grows_with(self) -> tuple[Factor, ...]:
-        """Its factors that have a text."""
+        """The factors that have a text."""
         return tuple(factor(item) for item in self.factors if isinstance(item, str))
 
     def counted_in(self, units: Units) -> Change:
-        """The change of an instrument with its scales."""
+        """The change with its factors counted in the scales `units`."""
         return dataclasses.replace(self, units=units)
 
     @property
     def applies_to_catalogue(self) -> bool:
-        """True if its effect on a star depends on the counts and the place of the star alone."""
+        """True if its effect on a star depends on nothing but the counts and the field position of that star."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(
             item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
@@ -196,12 +199,12 @@ class Change:
 
     @property
     def over_field(self) -> tuple[str, ...]:
-        """Its factors that are patterns over the field."""
+        """Texts of its factors that are patterns over the field."""
         return tuple(item.text for item in self.grows_with if item.depends_on == FIELD)
 
     @property
     def beside_field(self) -> tuple[str, ...]:
-        """Its factors that are no patterns over the field."""
+        """Texts of its factors that are no patterns over the field."""
         return tuple(item.text for item in self.grows_with if item.depends_on != FIELD)
 
     def times(self, *factors: str) -> Change:
@@ -209,7 +212,10 @@ class Change:
         return dataclasses.replace(self, factors=(*self.factors, *factors))
 
     def width(self, largest: Mapping[str, float]) -> float:
-        """Prior width of the amplitude: the change is as large as that where its factors are largest (`Context`)."""
+        """Prior width of the amplitude: the change is as large as its kind may be where its factors are largest.
+
+        `largest` are the largest values of factors (`Context`).
+        """
         sizes = (largest.get(item.text, 1.0) for item in self.grows_with)
         return AMPLITUDES[self.parameter].width / math.prod(sizes)
 
@@ -231,7 +237,7 @@ class Change:
         return matches[0]
 
     def factor(self, at: Any) -> Any:
-        """Product of its factors, 1 without any."""
+        """The product of its factors at `at`, 1 without any."""
         return product(self.factors, at, self.units)
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
@@ -371,7 +377,7 @@ class InExposures:
 
     @property
     def number(self) -> Any:
-        """Positions in the list."""
+        """Positions (e) of the exposures in the list."""
         return np.arange(len(self.exposures.hours))
 
     def angle(self, prefix: str) -> Any:

@@ -132,15 +132,18 @@ class Terms(Element):
     kind: ClassVar[str] = "described"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """All of them."""
+        """Mueller matrices of all the changes together at the wavelengths of a ray."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
         return matrix_of(sizes, ray.x, ray.y)
 
 
 class Film(Component):
-    """Changes of light that vary from exposure to exposure: of that from the sky, ahead of the polariser, or of that
-    behind the polariser, at its angle and only when it is in."""
+    """Changes of light that vary from exposure to exposure, ahead of the polariser or behind it.
+
+    Ahead of the polariser they act on light from the sky; behind it they act at the angle of the polariser, and only
+    when it is in.
+    """
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
@@ -148,7 +151,7 @@ class Film(Component):
     def through(
         self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
     ) -> Float[Array, "e 4"]:
-        """Stokes vectors behind it at a field point, one per exposure."""
+        """Stokes vectors (e, 4) behind the film at a field point, one for each exposure."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
         acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
@@ -167,7 +170,7 @@ class Inside:
     prefix: str
 
     def __call__(self, at: Any) -> Any:
-        """Its value in every exposure."""
+        """Its value (e), 0 or 1, in every exposure."""
         return np.isfinite(at.angle(self.prefix)) * 1.0
 
 
@@ -206,9 +209,9 @@ def _columns(terms: Sequence[Term]) -> dict[str, Any]:
     return {"changes": changes, "amplitudes": amplitudes}
 
 
-def beside(instrument: Instrument, element: Element, where: str, place: str) -> Instrument:
-    """The instrument with one more element ahead of another one, or behind it."""
-    return instrument.inserted(element, **{"before" if where == "ahead of" else "after": place})
+def beside(instrument: Instrument, element: Element, relation: str, place: str) -> Instrument:
+    """The instrument with `element` added "ahead of" or "behind" the element `place`; `relation` says which."""
+    return instrument.inserted(element, **{"before" if relation == "ahead of" else "after": place})
 
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
@@ -248,7 +251,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
-    """True for changes of light from the sky alone, ahead of the polariser."""
+    """True for a change of light from the sky alone, ahead of the polariser."""
     polariser = instrument.polariser
     return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
 
