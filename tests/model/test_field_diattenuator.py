@@ -144,7 +144,7 @@ def test_a_description_with_ties_shares_and_a_floor():
     ("old", "new", "words"),
     [
         ("split = true", "split = 1", "split = 1 must be true or false"),
-        ("floor = 0.01", "floor = 1.5", "share of the light"),
+        ("floor = 0.01", "floor = 1.5", "fraction of the light"),
         ("always_in = true", "always_in = 1.0", "must be true or false"),
         ("none_at = 0.6", "none_at = 0.5", "none_at"),
     ],

@@ -26,7 +26,9 @@ from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import Scalar, number
-from walop_jax.plans.available import plan_beside
+from walop_jax.plans.available import CandidateExposure, plan_beside
+from walop_jax.plans.exposure_plan import PlannedExposure
+from walop_jax.reports.wording import data_in_words
 from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -222,3 +224,8 @@ def test_a_reading_is_written_with_its_unit(instrument, calibration):
     assert SilentCell.reading_in_words(-5.0) == "−5"
     assert SilentCell.period is None
     assert "FLC at −5 V" in str(walop.matrix(calibration, x=0.0, y=0.0, at={"FLC": -5.0}))
+    assert dict(data_in_words(calibration))["FLC"] == "−5 V, 5 V"
+    choice = CandidateExposure("clp", "SDSS-r", {"FLC": -5.0}, 30.0, ())
+    assert choice.in_words(instrument.reading_in_words) == "clp, SDSS-r, FLC −5 V, 30 s"
+    line = PlannedExposure("clp", "SDSS-r", {"FLC": -5.0}, 45.0, -1, 1, 30.0, 1.0, 1.0, 30.0, 0.0)
+    assert line.cells(instrument.reading_in_words)[2:4] == ("FLC −5 V", "45.0°")

@@ -23,7 +23,7 @@ from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
 
-_LOOKED_AT = 1024  # field points whose intensities are looked at; in evenly spaced runs
+_LOOKED_AT = 1024  # field points whose intensities are looked at; in evenly spaced blocks
 FEW_ANGLES = 8
 """Angles of the polariser modulo 180° below which a set is in doubt."""
 _FEWEST_SETTINGS = 3

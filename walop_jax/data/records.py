@@ -82,12 +82,12 @@ ERROR_WORDS: Mapping[str, ErrorWord] = {
         "LIN_ERR", "", 0.02, "N of one camera, a share at 10⁶ electrons that grows with N"
     ),
     "scattered": ErrorWord(
-        "SCAT_ERR", "", 3e-3, "N of one camera, a share of its median counts in every exposure"
+        "SCAT_ERR", "", 3e-3, "N of one camera, a fraction of its median counts in every exposure"
     ),
     "pedestal": ErrorWord(
-        "BIAS_ERR", "", 3e-3, "N of one camera, a share of the usual counts, the same everywhere"
+        "BIAS_ERR", "", 3e-3, "N of one camera, a fraction of the usual counts, the same everywhere"
     ),
-    "leakage": ErrorWord("LEAK_ERR", "", 0.02, "N of one camera, a share of the light of another camera"),
+    "leakage": ErrorWord("LEAK_ERR", "", 0.02, "N of one camera, a fraction of the light of another camera"),
 }
 """The words of a primary header by the fields of `StatedErrors`."""
 

@@ -185,7 +185,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     if not 0 <= degree <= 12:
         raise read.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
     if not 0.0 <= floor < 1.0:
-        raise read.fault("cameras", f"floor = {floor:g} must be a share of the light from 0 to below 1")
+        raise read.fault("cameras", f"floor = {floor:g} must be a fraction of the light from 0 to below 1")
     raster = field.get("raster", RASTERS[0])
     if raster not in RASTERS:
         raise read.fault("field", f"raster = {raster!r} must be {' or '.join(RASTERS)}")

@@ -182,7 +182,7 @@ def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOU
     n = len(calset.points)
     if n <= most:
         return calset
-    fewest, largest = limits.RUNS
+    fewest, largest = limits.BLOCKS
     length = max(1, min(max(neighbours, most // largest), most // fewest))
     starts = _spread(n, most, length)
     index = (starts[:, None] + np.arange(length)).ravel()

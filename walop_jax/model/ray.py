@@ -130,7 +130,7 @@ class Ray(eqx.Module):
 
     @property
     def conditions(self) -> Conditions:
-        """The conditions at the wavelength nodes; ValueError for a ray without a wavelength."""
+        """The conditions at the wavelength nodes. Raises `NotPlannedError` for a ray without a wavelength."""
         if self.spectrum is None:
             raise NotPlannedError("conditions")
         return self.spectrum[1]

@@ -112,7 +112,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     rows, throughput = light.band_rows(instrument, plan, x, y), instrument.throughput.at(x, y)
     unmixed = dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, mixing=()))
     for name, about, vectors in (
-        ("analysers", "share of the light in each beam of its arm",
+        ("analysers", "fraction of the light in each beam of its arm",
          light.beams(instrument, rows) @ light.upstream(instrument, x, y)),
         ("cameras", "behind lenses, filter and detector of each camera",
          light.camera_vectors(unmixed, rows, throughput, x, y)),

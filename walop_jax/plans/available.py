@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,11 +93,12 @@ class CandidateExposure(NamedTuple):
         stops = tuple(dataclasses.replace(self.stops[0], polariser_angle=angle) for angle in angles)
         return self._replace(stops=stops, turn=turn)
 
-    def text(self) -> str:
-        """The choice in a few words: clp, SDSS-r, CHWP 45°, 30 s."""
-        stands = {p: "out" if a is None else f"{a:g}°" for p, a in self.positions.items()}
-        places = (f"{p} {where}" for p, where in stands.items())
-        return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
+    def in_words(self, reading_in_words: Callable[[str, float], str]) -> str:
+        """The choice in a few words: clp, SDSS-r, CHWP 45°, 30 s; by `Instrument.reading_in_words`."""
+        readings = (
+            f"{p} {'out' if a is None else reading_in_words(p, a)}" for p, a in self.positions.items()
+        )
+        return ", ".join([self.kind, self.filter, *readings, f"{self.seconds:g} s"])
 
 
 def with_stops(plan: ObservingPlan, stops: Iterable[Stop], **changes: Any) -> ObservingPlan:

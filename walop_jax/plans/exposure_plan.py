@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,15 +42,17 @@ class PlannedExposure:
     place: int | None = None
     needed: bool = False
 
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table of a plan."""
+    def cells(self, reading_in_words: Callable[[str, float], str]) -> tuple[str, ...]:
+        """The row of the table of a plan, with readings as `Instrument.reading_in_words` has them."""
         number = "" if self.number < 0 else f" {self.number}"
-        positions = ", ".join(f"{p} {_angle(a)}" for p, a in self.positions.items())
-        angle = _angle(self.polariser_angle if np.isfinite(self.polariser_angle) else None)
+        readings = (
+            f"{p} {'out' if a is None else reading_in_words(p, a)}" for p, a in self.positions.items()
+        )
+        angle = f"{self.polariser_angle:.1f}°" if np.isfinite(self.polariser_angle) else "out"
         exposures, time = f"{self.times} × {self.exptime:g} s", f"{self.seconds + self.change:.0f}"
         what = f"{self.kind}{number}" + ("" if self.place is None else f" at {self.place}")
         loss = f"{100 * (np.sqrt(self.left_out) - 1):+.2g} %{'; a go needs it' if self.needed else ''}"
-        return (what, self.filter, positions, angle, exposures, time, loss)
+        return (what, self.filter, ", ".join(readings), angle, exposures, time, loss)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -181,10 +183,6 @@ class ExposurePlan(Displayed):
             title=f"No go with {alone}: {'; '.join(self.lacks)}" if self.lacks else f"Plan of {exposures}",
             facts=tuple(facts.items()),
             head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
-            rows=tuple(line.cells() for line in self.lines),
+            rows=tuple(line.cells(self.observing_plan.design.reading_in_words) for line in self.lines),
             notes=self.notes,
         )
-
-
-def _angle(angle: float | None) -> str:
-    return "out" if angle is None else f"{angle:.1f}°"

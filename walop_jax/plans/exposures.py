@@ -145,7 +145,7 @@ def candidates(
 
     families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
-        tell(f"information of {choice.text()}")
+        tell(f"information of {choice.in_words(plan.design.reading_in_words)}")
         cost = choice.seconds + available.costs.of(choice.kind)
         if choice.kind == "clp":
             lit, counts = seen(choice, slice(start, stop))

@@ -262,7 +262,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     )  # fmt: skip
     right.set(xscale="log", xlim=(min(edges[0], goal / 1.5), max(edges[-1], 1.5 * goal)))
     style.plain_ticks(right.xaxis)
-    right.set(xlabel="error of p (%)", ylabel="share of the field (%)")
+    right.set(xlabel="error of p (%)", ylabel="fraction of the field (%)")
     return figure
 
 

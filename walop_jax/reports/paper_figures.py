@@ -158,7 +158,7 @@ def transmission_figure(
     below.axhline(0.0, color="0.6", lw=0.8)
     where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
     above.set_title(f"{where}, {filter_name}", loc="left")
-    above.set_ylabel("share of the light")
+    above.set_ylabel("fraction of the light")
     below.set(xlabel="polariser angle (deg)", ylabel="residual (%)")
     figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=style.ABOVE)
     style.angle_ticks(below)

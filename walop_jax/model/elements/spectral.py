@@ -89,7 +89,7 @@ class SpectralElement(WithCurves):
     delta: Curve | None = row("rad", "retardance at `delta_at`")
     diattenuation: Curve | None = row("", "diattenuation along the axis at `diattenuation_at`")
     rotation: Curve | None = row("deg", "turn of the polarisation at `rotation_at`")
-    loss: Curve | None = row("", "share of the polarisation lost at `loss_at`")
+    loss: Curve | None = row("", "fraction of the polarisation lost at `loss_at`")
     spread: Curve | None = row("", "share lost across the axis at `spread_at`")
     axis: Scalar = number("deg", "fast axis, from +X toward +Y")
     delta_at: tuple[float, ...] = eqx.field(static=True, default=())
