@@ -67,19 +67,19 @@ class ErrorWord(NamedTuple):
 
 ERROR_WORDS: Mapping[str, ErrorWord] = {
     "position": ErrorWord("POS_ERR", "arcsec", 1.0, "X and of Y, common to all field points"),
-    "scale": ErrorWord("SCAL_ERR", "", 1e-3, "the scale of X and Y, a share"),
+    "scale": ErrorWord("SCAL_ERR", "", 1e-3, "the scale of X and Y, a fraction"),
     "turn": ErrorWord("TURN_ERR", "rad", 1e-3, "the angle by which the field is turned"),
     "wavelength": ErrorWord(
         "WAVE_ERR", "um", 3e-3, "the wavelengths of a filter curve, common to all of them"
     ),
-    "teff": ErrorWord("TEFF_ERR", "", 0.05, "TEFF, a share, common to all exposures of a KIND"),
+    "teff": ErrorWord("TEFF_ERR", "", 0.05, "TEFF, a fraction, common to all exposures of a KIND"),
     "pointing": ErrorWord("RA_ERR", "arcsec", 60.0, "RA and of DEC of sky exposures, common to all of them"),
     "time": ErrorWord("MJD_ERR", "s", 1.0, "MJD of sky exposures, common to all of them"),
     "site": ErrorWord("SITE_ERR", "deg", 0.01, "SITELAT and of SITELONG"),
     "rotator": ErrorWord("ROT_ERR", "deg", 0.1, "ROTATOR, common to all exposures of a KIND"),
-    "sky": ErrorWord("SKY_ERR", "", 0.02, "SKY, a share, common to all intensities"),
+    "sky": ErrorWord("SKY_ERR", "", 0.02, "SKY, a fraction, common to all intensities"),
     "linearity": ErrorWord(
-        "LIN_ERR", "", 0.02, "N of one camera, a share at 10⁶ electrons that grows with N"
+        "LIN_ERR", "", 0.02, "N of one camera, a fraction at 10⁶ electrons that grows with N"
     ),
     "scattered": ErrorWord(
         "SCAT_ERR", "", 3e-3, "N of one camera, a fraction of its median counts in every exposure"

@@ -237,7 +237,7 @@ class _Maker:
                 if key == "wavelength":
                     self.check_wavelengths(values[key], key, place)
                 if key in SHARES and np.max(np.abs(values[key])) > 1.0:
-                    what = f"{key} = {values[key]:g} must be between 0 and 1 (a share, not per cent)"
+                    what = f"{key} = {values[key]:g} must be between 0 and 1 (a fraction, not per cent)"
                     raise self.read.fault(place, what)
             else:
                 raise self.read.fault(place, str(unknown_name("key", key, [*numbers, *plain])))
