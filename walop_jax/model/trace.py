@@ -99,7 +99,9 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
             about = element.__doc__ or ""
             if element.moves is not None:
                 (angle,) = fold.angles_of(element, plan.moving, plan.positions[:1])
-                about = "out of the beam" if angle is None else f"at {element.reading_in_words(angle)}"
+                about = (
+                    "out of the beam" if angle is None else f"at {element.reading_in_words(_middle(angle))}"
+                )
             stages.append(_one(element.name, about, weight @ nodes))
     of_arms = [
         weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)
@@ -120,6 +122,10 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     ):  # fmt: skip
         stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(vectors @ beam)))
     return tuple(stages)
+
+
+def _middle(angle: fold.Angle) -> float:
+    return angle.middle if isinstance(angle, fold.Turning) else angle
 
 
 def _through(matrix: Float[Array, "... 4 4"] | None, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"]:

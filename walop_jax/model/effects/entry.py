@@ -342,4 +342,4 @@ def _behind(change: Change, instrument: Instrument) -> Change:
     if not at or (polariser is not None and name == polariser.name):
         return change
     before = f"{arm}.{path[at - 1]}" if arm else path[at - 1]
-    return dataclasses.replace(change, where="behind", place=before)
+    return dataclasses.replace(change, relation="behind", place=before)
