@@ -1,4 +1,4 @@
-"""Compiled programs on disk: the same results, nothing of what they were not made for, nothing of a user's classes."""
+"""Traced programs on disk: the same results, nothing of what they were not traced for, nothing of a user's classes."""
 
 from __future__ import annotations
 
@@ -52,20 +52,6 @@ def test_a_second_process_need_not_trace(programs):
     for one, two, three in zip(*map(jax.tree.leaves, (first, again, direct)), strict=True):
         np.testing.assert_array_equal(one, two)
         np.testing.assert_allclose(one, three, rtol=1e-15)
-
-
-def test_a_program_that_the_cache_of_jax_has_as_well_is_kept_whole(programs):
-    """Code that is read from there, and then written, lacks its functions."""
-    before = jax.config.jax_persistent_cache_min_compile_time_secs
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    for _ in range(2):
-        first = compiled(double, kept_as="double")({"a": np.arange(4.0)})
-        (file,) = programs.iterdir()
-        again = compiled(untraceable, kept_as="double")({"a": np.arange(4.0)})
-        np.testing.assert_array_equal(first["twice"]["a"], again["twice"]["a"])
-        file.unlink()
-        jax.clear_caches()
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
 
 
 @pytest.mark.parametrize(

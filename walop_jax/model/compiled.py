@@ -1,13 +1,12 @@
-"""Compilation with the options of this package, and compiled programs kept on disk.
+"""Compilation with the options of this package, and traced programs kept on disk.
 
-JAX keeps compiled code between processes as well, but under the text of the program, for which Python must trace the
-optics with all their derivatives: that takes longer than most fits. So programs are kept under a key of their
-dependences: the name of the function, the structure of its arguments with all non-numbers (elements, effects, choices),
-shapes and types, the options of compilation, the processor, the source of this package and the versions of the packages
-that trace and compile. Programs with other arguments (a class of a user, a closure) are not kept, nor are those that
-cannot be written, nor any where there are several devices: each would need code of its own.
+JAX keeps compiled code between processes, under the text of the program; but for the text Python must trace the optics
+with all their derivatives, which takes longer than most fits. So the text (StableHLO, `jax.export`) is kept as well,
+under a key of its dependences: the name of the function, the structure of its arguments with all non-numbers (elements,
+effects, choices), shapes and types, the source of this package and the versions of the tracing packages. Programs with
+other arguments (a class of a user, a closure) are not kept, nor are programs that cannot be exported.
 
-Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like all compiled
+Programs are kept where JAX's cache folder has a folder `programs`, which the command line makes; like compiled
 code they are executed: the folder must be the user's own. A damaged file is written anew.
 
 On CPU the fusion emitters of XLA compute shared sub-expressions over and over when a derivative of the plates is
@@ -33,19 +32,16 @@ import importlib.metadata
 import json
 import operator
 import os
-import platform
-import secrets
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.experimental import serialize_executable
+from jax import export
 
 from walop_jax.io.code import cores
 
@@ -80,16 +76,15 @@ def program(
     """Program of `function` for arguments like these, from the folder or new to it; None where it cannot be kept."""
     leaves, tree = jax.tree.flatten(args)
     try:
-        key = _key(name, options, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
+        key = _key(name, tree.unflatten(range(tree.num_leaves)), [kind(leaf) for leaf in leaves])
         stored = _read(directory / key)
         if stored is None:
-            structure, run = _compiled(function, tree, leaves, options)
-            _write(directory / key, (structure, serialize_executable.serialize(run)[0]))
-        else:
-            structure, run = stored[0], _loaded(*stored, len(leaves))
+            stored = _traced(function, tree, leaves)
+            _write(directory / key, stored)
+        structure, exported = stored[0], export.deserialize(bytearray(stored[1]))
     except Exception:  # the call itself raises the error, if it matters
         return None
-    shape = jax.tree.structure(structure)
+    run, shape = jax.jit(exported.call, compiler_options=options), jax.tree.structure(structure)
     return lambda *args: shape.unflatten(run(*jax.tree.leaves(args)))
 
 
@@ -99,10 +94,8 @@ def kind(leaf: Any) -> tuple[Any, ...]:
     return aval.shape, aval.dtype, bool(aval.weak_type)
 
 
-def _compiled(
-    function: Callable[..., Any], tree: Any, leaves: Sequence[Any], options: dict[str, Any] | None
-) -> tuple[Any, jax.stages.Compiled]:
-    """The structure of the results of a program, and the program itself, of leaves to leaves."""
+def _traced(function: Callable[..., Any], tree: Any, leaves: Sequence[Any]) -> tuple[Any, bytes]:
+    """The structure of the results of a program, and the program as bytes."""
     shapes: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
@@ -110,36 +103,15 @@ def _compiled(
         shapes.append(shape)
         return results
 
-    # A name that JAX's cache does not know: code that was read from there cannot be written again.
-    flat.__name__ = f"program_{secrets.token_hex(8)}"
-    run = jax.jit(flat, compiler_options=options).lower(*leaves).compile()
-    return shapes[-1].unflatten(range(shapes[-1].num_leaves)), run
+    exported = export.export(jax.jit(flat))(*leaves)
+    return shapes[-1].unflatten(range(shapes[-1].num_leaves)), bytes(exported.serialize())
 
 
-def _loaded(structure: Any, payload: bytes, arguments: int) -> jax.stages.Compiled:
-    """A program from its bytes; `structure` is that of its results."""
-    taken = jax.tree.structure(((0,) * arguments, {}))
-    given = jax.tree.structure([0] * jax.tree.structure(structure).num_leaves)
-    return serialize_executable.deserialize_and_load(payload, taken, given)
-
-
-def _key(name: str, options: dict[str, Any] | None, structure: Any, kinds: Sequence[Any]) -> str:
-    if len(jax.devices()) > 1:
-        raise _NotKept("several devices")
-    flags = os.environ.get("XLA_FLAGS", ""), sorted((options or {}).items()), _processor()
+def _key(name: str, structure: Any, kinds: Sequence[Any]) -> str:
+    flags = os.environ.get("XLA_FLAGS", "")
     double = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     description = repr((name, kinds, jax.default_backend(), double, flags)) + json.dumps(_plain(structure))
     return hashlib.sha256(_source() + description.encode()).hexdigest()
-
-
-@functools.cache
-def _processor() -> str:
-    """Kind of the device, and what this processor can do: its code need not run on another one."""
-    found = ""
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        found = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return f"{jax.devices()[0].device_kind} {platform.machine()} {platform.processor()} {found}"
 
 
 def _plain(value: Any) -> Any:
@@ -222,13 +194,13 @@ def _read(path: Path) -> tuple[Any, bytes] | None:
         if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
             os.utime(path)
             text, _, payload = content[_DIGEST:].partition(b"\n")
-            return _made(json.loads(text)), zlib.decompress(payload)
+            return _made(json.loads(text)), payload
     return None
 
 
 def _write(path: Path, kept: tuple[Any, bytes]) -> None:
     """Write a program in one step and remove the oldest beyond `_MOST`; failures of the disk are ignored."""
-    content = json.dumps(_plain(kept[0])).encode() + b"\n" + zlib.compress(kept[1], 1)
+    content = json.dumps(_plain(kept[0])).encode() + b"\n" + kept[1]
     with contextlib.suppress(OSError):
         handle, name = tempfile.mkstemp(dir=path.parent)
         try:
@@ -292,8 +264,6 @@ def compiled(
         if directory is None:
             return None
         leaves, tree = jax.tree.flatten(args)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # pyright: ignore[reportAttributeAccessIssue]
-            return None  # part of another program
         at = tree, tuple(kind(leaf) for leaf in leaves), once
         if at not in programs:
             programs[at] = program(directory, kept_as, function, args, options(once))
@@ -365,8 +335,6 @@ def cache_folder() -> Path | None:
 def switch_on() -> None:
     """Switch JAX on for a program: float64, and the cache of compiled code, which makes later runs start fast."""
     jax.config.update("jax_enable_x64", True)
-    # Where in the source an operation is from: nobody asks a program for it, and it is a tenth of tracing.
-    jax.config.update("jax_traceback_in_locations_limit", 0)
     path = cache_folder()
     if path is not None:
         with contextlib.suppress(OSError):
