@@ -335,6 +335,8 @@ def cache_folder() -> Path | None:
 def switch_on() -> None:
     """Switch JAX on for a program: float64, and the cache of compiled code, which makes later runs start fast."""
     jax.config.update("jax_enable_x64", True)
+    # Where in the source an operation is from: nobody asks a program for it, and it is a tenth of tracing.
+    jax.config.update("jax_traceback_in_locations_limit", 0)
     path = cache_folder()
     if path is not None:
         with contextlib.suppress(OSError):
