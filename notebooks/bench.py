@@ -53,7 +53,7 @@ def bench_table(seed: int = 0, electrons: float = 1e6) -> list[BenchRow]:
     for p in model.parameters:
         if p.part in _ABSENT:
             model = model.change(p.name, free=False)
-    fitted = Calibration.from_fit(FitResult.of(Likelihood.of(run.calset, model)).judged())
+    fitted = Calibration.from_fit(FitResult.of(Likelihood.of(run.calset, model)).with_verdict())
     true = dataclasses.replace(fitted, values=np.array([run.values[n] for n in model.names]))
     x, y = np.array(TILTS), np.full(len(TILTS), run.calset.points.y[0])
     settings = dataclasses.replace(Settings.default(1), teff=np.array([plan.teff]))

@@ -117,7 +117,7 @@ def measured_matrix(calset: CalibrationSet) -> tuple[np.ndarray, np.ndarray]:
 
 def calibration_of(result: FitResult) -> walop.Calibration:
     """The calibration of a fit, whatever it leaves: that is what the notebook is about."""
-    return walop.Calibration.from_fit(result.judged())
+    return walop.Calibration.from_fit(result.with_verdict())
 
 
 def predicted_matrix(calibration, x, y, wavelengths):

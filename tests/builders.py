@@ -19,7 +19,7 @@ from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 
 NAN = float("nan")
 _BLANK: dict[str, Any] = {
@@ -173,8 +173,8 @@ def _counts(
     band: jax.Array,
 ) -> jax.Array:
     rows = light.band_rows(instrument, plan, x, y)
-    sight = Sight(plan.exposures, sky, source, x, y)
-    return light.counts(instrument, rows, instrument.throughput.at(x, y), sight, band)
+    illumination = PointIllumination(plan.exposures, sky, source, x, y)
+    return light.counts(instrument, rows, instrument.throughput.at(x, y), illumination, band)
 
 
 _compiled_counts = compiled(_counts)

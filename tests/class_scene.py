@@ -36,9 +36,9 @@ def told() -> tuple[FitResult, Any]:
 def diagnosed() -> Diagnosis:
     """The diagnosis that has found that class, nothing searched for."""
     result, classes = told()
-    after = result.judged()
+    after = result.with_verdict()
     for sentence in only_a_class(classes):
-        after = after.doubted(Quality.CLASS_ONLY, sentence)
+        after = after.with_doubt(Quality.CLASS_ONLY, sentence)
     residual = result.likelihood.residuals(result.values)[1]
     step = Step(
         effect=Described.name, parameters={}, score=0.0, p_value=0.0, log_bayes=0.0,
@@ -55,7 +55,7 @@ def diagnosed() -> Diagnosis:
         unexplained=None,
         p_value=0.0,
         remaining_p=1.0,
-        before=result.judged(),
+        before=result.with_verdict(),
         after=with_average(after, classes),
         seconds=0.0,
         points=len(result.calset.points),

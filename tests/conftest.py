@@ -160,7 +160,7 @@ def south_fit() -> Callable[[SouthSet], FitResult]:
     from walop_jax.data.calset import read_calibration_set
     from walop_jax.fit.refit import refit
 
-    return functools.cache(lambda south: refit(read_calibration_set(south.path)).judged())
+    return functools.cache(lambda south: refit(read_calibration_set(south.path)).with_verdict())
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ SEED = 4
 @functools.cache
 def small_fit() -> FitResult:
     """The fit of a small run, made once, with the verdict on χ² and priors alone."""
-    return refit(simulate(SMALL, seed=SEED).calset).judged()
+    return refit(simulate(SMALL, seed=SEED).calset).with_verdict()
 
 
 @functools.cache
@@ -35,4 +35,4 @@ def small_fit_stating(**errors: float) -> FitResult:
 @functools.cache
 def small_fit_with_plate() -> FitResult:
     """The same of a run with the calibration plate."""
-    return refit(simulate(WITH_PLATE, seed=SEED).calset).judged()
+    return refit(simulate(WITH_PLATE, seed=SEED).calset).with_verdict()

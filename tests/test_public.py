@@ -6,6 +6,7 @@ import ast
 import doctest
 import inspect
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -53,6 +54,11 @@ def test_the_example_of_a_public_name(name: str, at_hand, monkeypatch: pytest.Mo
             (call,) = [node for node in calls if ast.unparse(node.func) == f"walop.{name}"]
             keywords = {str(word.arg): None for word in call.keywords}
             inspect.signature(getattr(walop_jax, name)).bind(*call.args, **keywords)
+
+
+def test_the_package_says_what_every_public_name_is_for():
+    words = set(re.findall(r"\w+", inspect.getdoc(walop_jax) or ""))
+    assert set(walop_jax.__all__) - words == set()
 
 
 def test_public_names_are_there_once_each():

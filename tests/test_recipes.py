@@ -29,7 +29,7 @@ SCRIPTS = {
 SAID = {
     "The posterior of two thicknesses": "half1.plate.mgf2",
     "p of my stars": "P_DEBIASED",
-    "Freeze the wedge": "fixed",
+    "Fix the wedge": "fixed",
     "An effect of my own": "Diagnosis (",
     "Compare two nights": "the instrument has changed",
     "My arrays": "Fit of WALOP-SOUTH",
@@ -49,7 +49,7 @@ def folder(tmp_path_factory) -> Path:
     write_calibration_set(path / "run.fits", calset)
     write_calibration_set(path / "night2.fits", simulate(SMALL, seed=SEED + 1).calset)
     (path / "RUN").mkdir()
-    write_calibration(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).judged()))
+    write_calibration(path / "RUN" / "calibration.fits", Calibration.from_fit(refit(calset).with_verdict()))
     x, y = np.random.default_rng(0).uniform(-0.25, 0.25, (2, 30))
     Table({"X": x, "Y": y}).write(path / "stars.csv")
     four(walop.simulate(SMALL, seed=SEED, stars=60), path, ascii_head)

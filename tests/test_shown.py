@@ -5,9 +5,10 @@ from __future__ import annotations
 import inspect
 
 import pytest
-from small_run import SEED, SMALL
+from small_run import SEED, SMALL, small_fit
 
 import walop_jax as walop
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.commands import COMMANDS
 
 LONGEST = 200  # characters of a line about one thing
@@ -51,3 +52,24 @@ def test_watched_effects_are_those_that_change_from_night_to_night():
         "chwp_axis", "filter_shift", "hwp1_axis", "hwp1_crossing", "hwp2_axis", "hwp2_crossing",
         "telescope_polarisation", "upstream_retarder", "wollaston_axis",
     ]  # fmt: skip
+
+
+def test_working_parts_are_not_between_results():
+    """`dir`, and with it completion, names what a user may want; other rooms still find the rest."""
+    result = small_fit()
+    calibration = Calibration.from_fit(result)
+    for one, working in (
+        (result, ("with_verdict", "with_doubt", "with_remark", "checked_verdict", "shown", "of")),
+        (calibration, ("shown", "widened", "with_covariance", "matrix_columns")),
+        (result.verdict, ("on_top_of", "recorded", "answers")),
+    ):
+        assert [name for name in working if not hasattr(one, name)] == []
+        assert set(working) & set(dir(one)) == set()
+    assert {"residuals", "to_table", "trusted", "covariance", "plot", "save"} <= set(dir(result))
+    assert {"matrix", "flags", "covariance", "maps"} <= set(dir(calibration))
+
+
+def test_help_lists_every_argument_of_refit():
+    text = inspect.getdoc(walop.refit) or ""
+    arguments = text.split("Arguments:\n")[1].split("\n\n")[0].splitlines()
+    assert [line.split(":")[0] for line in arguments] == list(inspect.signature(walop.refit).parameters)

@@ -1,12 +1,60 @@
 """Differentiable end-to-end calibration of the WALOP four-camera imaging polarimeters.
 
-Every command is a function of the same name, with the same options: `refit`, `diagnose`, `sample`, `matrix`, `apply`
-and so on. `read` reads whatever the program has written; `from_arrays` makes a calibration set of arrays. The public
-names are those of `__init__.pyi`; everything else lives in the rooms of the package and may move.
+Every command of `walop-jax` is a function of the same name with the same options; what it returns shows itself as a
+short table. The public names, by what they are for:
 
-Nothing is loaded before it is used, so that importing the package is free of charge. It computes in float64: the first
-name that is asked for switches JAX to it. Where arrays have been made in float32 already, or float64 was switched off
-later, the session stays as it is, and the package computes in float64 all the same.
+Calibrate
+    read                    calibration sets, a calibration, or the folder of a run
+    from_arrays             a calibration set of arrays in memory
+    write_calibration_set   a calibration set as a FITS file
+    inspect                 contents and faults of calibration sets
+    refit                   fit a set: a `FitResult` with values, covariance and verdict
+    refit_many              the same for many sets of one layout, in one program
+    diagnose                find what the model lacks, add it, and fit again
+    sample                  draws from the posterior
+    check                   is this calibration good for my stars, and if not, what to do
+    matrix                  the instrument matrix with its errors at field points
+    residual_map            what a smooth model leaves over the field
+    compare                 the joint fit beside the polynomials of Paper II
+    report, plot            the page of a run; one of its figures
+    cite                    sources of the physics in a fit
+    demo                    all of it with a small set that comes with the package
+
+Plan
+    plan                    the calibration exposures that make the error of p smallest
+    simulate                a calibration set of an instrument as it may be built
+    limits                  the size at which each effect would be detected and named
+    exposures               the table EXPOSURES from the records of an observatory
+    standards               standard stars with bands and errors
+    ObservingPlan           a calibration run: where, when, through what
+
+Stars and nights
+    gather                  one catalogue from the catalogues of the cameras
+    apply                   Stokes parameters of stars with their errors
+    check_common_table      faults of a common table of stellar polarisation
+    stack                   many nights, each parameter under a law of time
+
+Models and JAX
+    instrument, trace       an instrument as described; light followed through it
+    base_model, model       the model of a plain fit; the same as a file
+    with_effects            the model with effects of the catalogue or of your own
+    with_noise              the model with errors of the data that are fitted
+    forward                 counts, residuals and densities as functions for jit, grad and vmap
+    effect_by_name, EFFECTS one effect; all effects that have a name
+
+Extend
+    Element, number         a class of optical elements; a number of such a class
+    Effect, param           a class of effects; a parameter of such a class
+    Scalar                  the type of a number in both
+
+What functions take and return
+    CalibrationSet, FilterCurve, Settings, Instrument, Model, Likelihood, Forward, FitResult, ManyFits, Calibration,
+    Run, Options, DataError, docs (the pages)
+
+The public names and their homes are those of `__init__.pyi`; everything else lives in the rooms of the package and may
+move. Nothing is loaded before it is used, so that importing the package is free of charge. It computes in float64: the
+first name that is asked for switches JAX to it. Where arrays have been made in float32 already, or float64 was
+switched off later, the session stays as it is, and the package computes in float64 all the same.
 """
 
 from __future__ import annotations
@@ -22,9 +70,9 @@ __version__ = "0.1.0"
 
 @functools.cache
 def _homes() -> dict[str, tuple[str, str]]:
-    """Module and name there of every name: the imports of `__init__.pyi`, which type checkers read as well.
+    """Module, and name in it, of every public name: the imports of `__init__.pyi`, which type checkers read as well.
 
-    Those with an underscore are no public names, but what methods of results in the rooms below come to.
+    Names with an underscore are not public: methods of results in lower rooms call them.
     """
     import ast
     from importlib.resources import files

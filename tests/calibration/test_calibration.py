@@ -259,23 +259,24 @@ def test_models_without_data():
 
 
 def test_quality_bits_follow_the_fit(result):
-    assert result.judged().verdict.quality == 0
+    assert result.with_verdict().verdict.quality == 0
     minimum = dataclasses.replace(result.minimum, result=RESULTS.stagnation, condition=1e11)
     expansion = dataclasses.replace(result.expansion, data=10.0 * result.dof)
     values = result.values.copy()
     index = result.model.index("pupil.magnification")
     values[index] += 5 * result.model.parameters[index].prior[1]
     bad = dataclasses.replace(result, minimum=minimum, expansion=expansion, values=values)
-    assert bad.judged().verdict.quality == 1 | 2 | 4 | 8 | 8192
+    assert bad.with_verdict().verdict.quality == 1 | 2 | 4 | 8 | 8192
     assert bad.at_prior_edge == ("pupil.magnification",)
     values = result.values.copy()
     values[result.model.index("half1.efficiency")] += 0.05  # a number without a unit
-    warnings = dataclasses.replace(result, values=values).judged().verdict.warnings
+    warnings = dataclasses.replace(result, values=values).with_verdict().verdict.warnings
     (edge,) = (text for text in warnings if text.startswith("half1.efficiency"))
     assert re.fullmatch(r"half1\.efficiency = \S+ lies \S+ prior widths from \S+", edge)
     slightly = dataclasses.replace(result.expansion, data=result.dof * 1.0 + 20.0 * np.sqrt(result.dof))
     assert (
-        dataclasses.replace(result, expansion=slightly).judged(["odd"]).verdict.quality & ~8 == 8192 | 32768
+        dataclasses.replace(result, expansion=slightly).with_verdict(["odd"]).verdict.quality & ~8
+        == 8192 | 32768
     )
 
 

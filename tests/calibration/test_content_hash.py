@@ -19,7 +19,7 @@ from walop_jax.calibration.calibration import UNCHECKED
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.product import content_of, read_calibration, write_calibration
 from walop_jax.data.calset import read_calibration_set
-from walop_jax.fit.verdict import Hidden, Mistake, Structure
+from walop_jax.fit.verdict import Hidden, Structure, UndetectedError
 from walop_jax.io.errors import DataError
 
 OF_FITS = re.compile(
@@ -36,7 +36,7 @@ EARLIER = Path(__file__).with_name("product_of_an_earlier_rule.fits.gz")
 def path(two_cameras, tmp_path):
     """A product with everything that a product may hold."""
     product = product_of(read_calibration_set(two_cameras.write()), 2, {"HWP": 22.5})
-    mistakes = Mistake("scale of X and Y", 0.02, ""), Mistake("pedestal", 1.5, "electron")
+    mistakes = UndetectedError("scale of X and Y", 0.02, ""), UndetectedError("pedestal", 1.5, "electron")
     hidden = Hidden(mistakes, np.arange(4.0).reshape(2, 2))
     verdict = dataclasses.replace(product.verdict, structure=Structure(1e-4, 2e-5))
     full = with_other(product, hidden=hidden, verdict=verdict)

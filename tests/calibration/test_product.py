@@ -138,8 +138,8 @@ def test_is_ordinary_fits(path):
 
 
 def test_no_sources_no_warnings_no_inputs(product, tmp_path):
-    bits = tuple(doubt for doubt in product.verdict.against if not doubt.sentence)
-    verdict = dataclasses.replace(product.verdict, against=bits)
+    bits = tuple(doubt for doubt in product.verdict.doubts if not doubt.sentence)
+    verdict = dataclasses.replace(product.verdict, doubts=bits)
     bare = changed(product, verdict=verdict, inputs=())
     write_calibration(tmp_path / "bare.fits", bare)
     assert_equal(bare, read_calibration(tmp_path / "bare.fits", any_model=True))

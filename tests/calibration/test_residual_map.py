@@ -144,7 +144,7 @@ def test_cells_without_enough_light_hold_no_number(cells):
 
 def test_every_point_has_a_cell(noiseless, cells):
     likelihood = likelihood_of(noiseless.calset)
-    grid = cells_for(likelihood.layout.points, likelihood.census, residual_map.POINTS_PER_CELL)
+    grid = cells_for(likelihood.layout.points, likelihood.used_data, residual_map.POINTS_PER_CELL)
     x, y = likelihood.calset.points.x, likelihood.calset.points.y
     cell = cell_of(grid, x, y)
     np.testing.assert_array_equal(np.bincount(cell), np.full(36, 16))

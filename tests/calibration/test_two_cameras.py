@@ -95,7 +95,7 @@ def instrument(tmp_path_factory) -> Instrument:
 
 @pytest.fixture(scope="module")
 def model(instrument) -> Model:
-    return make_model(instrument.name, instrument, frozen=("throughput.n0.p00",))
+    return make_model(instrument.name, instrument, fixed=("throughput.n0.p00",))
 
 
 @pytest.fixture(scope="module")

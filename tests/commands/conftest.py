@@ -39,7 +39,7 @@ class FittedSet:
 @pytest.fixture(scope="session")
 def fitted(calset_file, tmp_path_factory) -> FittedSet:
     run = tmp_path_factory.mktemp("fitted") / "RUN"
-    result = refit(read_calibration_set(calset_file)).judged()
+    result = refit(read_calibration_set(calset_file)).with_verdict()
     result.save(run)
     return FittedSet(calset_file, Calibration.from_fit(result), run)
 

@@ -76,7 +76,7 @@ def test_reasons_are_ranked_by_what_they_do_to_stars():
         doubt("worse", off=5e-3, remedy="again"),
         doubt("anything"),
     )
-    verdict = Verdict(against=against, subject="RUN")
+    verdict = Verdict(doubts=against, subject="RUN")
     assert [one.what for one in verdict.reasons] == ["anything", "worse", "bad", "large", "small", "a remark"]
     assert verdict.words == NO_GO
     assert verdict.document()["reasons"][1] == {
@@ -86,7 +86,7 @@ def test_reasons_are_ranked_by_what_they_do_to_stars():
     assert lines[0] == "RUN: no go: anything"
     assert lines[2] == "  also         worse (q, u off by 0.50 %); again"
     assert lines[4] == "               large (q, u off by 1.0 %); look"
-    reserved = Verdict(against=against[:3], subject="RUN")
+    reserved = Verdict(doubts=against[:3], subject="RUN")
     assert reserved.first_line == "RUN: go, with reservations: large (q, u off by 1.0 %); look"
     assert reserved.go
     assert Verdict(subject="RUN").display().text().splitlines() == [
@@ -142,7 +142,7 @@ def made(call, fitted: FittedSet, of_file, catalogue, tmp_path, monkeypatch, fou
     """What a command prints first and its document, of a sound or a doubted fit; nothing is fitted."""
 
     def printed(command: str, doubts: list[str]) -> tuple[str, dict[str, Any]]:
-        fit = of_file.judged(doubts)
+        fit = of_file.with_verdict(doubts)
         monkeypatch.setattr("walop_jax.fit.refit.refit", lambda *args, **more: fit)
         monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda result, *args, **more: fit)
         comes_out(dataclasses.replace(found, after=fit, unexplained=None), monkeypatch)
@@ -377,7 +377,7 @@ def test_all_that_is_neither_is_refused_at_once_with_advice(call, run: Path, tmp
 
 
 def test_an_untrusted_calibration_is_no_go_for_whatever_is_asked(call, catalogue: Path, tmp_path: Path):
-    small_fit().judged(["the residuals are odd"]).save(tmp_path / "BAD")
+    small_fit().with_verdict(["the residuals are odd"]).save(tmp_path / "BAD")
     done = call("check", tmp_path / "BAD", catalogue)
     assert done.exit_code == 3
     assert (

@@ -22,7 +22,7 @@ X, Y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
 def product() -> Calibration:
     """The mean over the class, made here of the plain fit."""
     result, classes = told()
-    return averaged(Calibration.from_fit(result.judged()), classes)
+    return averaged(Calibration.from_fit(result.with_verdict()), classes)
 
 
 @pytest.fixture(params=["diagnosis", "its last fit"])
@@ -31,7 +31,7 @@ def given(request):
 
 
 def test_the_product_is_not_the_fit(product):
-    plain = Calibration.from_fit(told()[0].judged())
+    plain = Calibration.from_fit(told()[0].with_verdict())
     (m, c), (one, alone) = product.matrix(X, Y), plain.matrix(X, Y)
     assert np.all(np.abs(m[:, 0] - one[:, 0]) > 2 * np.sqrt(alone[:, 0, 0]))
     assert np.all(c[:, 0, 0] > 5 * alone[:, 0, 0])
@@ -49,7 +49,7 @@ def test_stars_are_calibrated_with_the_product(given, product):
     counts = np.array([[5.0, 4.8, 4.9, 5.1], [4.9, 5.0, 5.2, 4.8]]) * 1e5
     stars = {"X": X, "Y": Y, "N": counts, "N_ERR": np.sqrt(counts)}
     ours, theirs = walop.apply(given, stars), walop.apply(product, stars)
-    plain = walop.apply(Calibration.from_fit(told()[0].judged()), stars)
+    plain = walop.apply(Calibration.from_fit(told()[0].with_verdict()), stars)
     for name in ("Q", "U", "Q_ERR", "U_ERR", "CHI2"):
         np.testing.assert_array_equal(ours[name], theirs[name])
     assert np.all(np.abs(ours["Q"] - plain["Q"]) > 3e-4)

@@ -16,7 +16,7 @@ from walop_jax.model.effects.change import Change
 
 @pytest.fixture(scope="module")
 def found() -> Diagnosis:
-    fit = small_fit().judged()
+    fit = small_fit().with_verdict()
     step = Step(
         effect="described",
         parameters={"turn": (0.1, 0.01, "deg")},
@@ -85,7 +85,7 @@ def test_print_command_and_page_say_the_same(found: Diagnosis, call, calset_file
 def test_what_is_not_to_be_used_is_not_recommended(
     verdict, words, doubts, found: Diagnosis, call, calset_file, tmp_path, monkeypatch
 ):
-    made = dataclasses.replace(found, verdict=verdict, after=small_fit().judged(doubts))
+    made = dataclasses.replace(found, verdict=verdict, after=small_fit().with_verdict(doubts))
     comes_out(made, monkeypatch)
     done = call("diagnose", calset_file, "-o", tmp_path / "made")
     assert done.exit_code == 3  # as of every other command whose calibration is not to be used

@@ -231,7 +231,7 @@ def test_effects_of_ones_own_are_told_apart(call, tmp_path, monkeypatch):
 
 def test_what_a_fit_in_memory_left_undecided(tmp_path):
     """It has no diagnosis; asking it for one ended in a TypeError."""
-    result = refit(simulate(ObservingPlan(grid=3, moon_patches=2, standards=3), seed=1).calset).judged()
+    result = refit(simulate(ObservingPlan(grid=3, moon_patches=2, standards=3), seed=1).calset).with_verdict()
     for wish in ({"after": result, "criterion": "apart"}, {"separate": result}):
         with pytest.raises(
             DataError, match="no diagnosis; run diagnose first, or name the effects with --apart"

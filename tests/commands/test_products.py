@@ -39,7 +39,9 @@ def test_what_a_new_fit_lacks_is_looked_for_without_trying_other_readings_again(
     call, fitted: FittedSet, monkeypatch
 ):
     asked: dict[str, object] = {}
-    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda result, seed: result.judged(["odd"]))
+    monkeypatch.setattr(
+        "walop_jax.diagnosis.trust.examined", lambda result, seed: result.with_verdict(["odd"])
+    )
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *_, **how: asked.update(how))
     assert call("check", fitted.run, fitted.calset, "--seed", 5).exit_code == 3
     assert asked["as_written"] is True

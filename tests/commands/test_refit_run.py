@@ -98,7 +98,9 @@ def test_a_fit_that_does_not_converge_leaves_no_calibration(fitted: FittedSet, c
     assert json.loads((tmp_path / "RUN" / "summary.failed.json").read_text())["misfit"] is not None
     monkeypatch.undo()
     # What the residuals say takes most of the time of a fit, and is of no concern here.
-    monkeypatch.setattr("walop_jax.diagnosis.trust.examined", lambda result, *arguments: result.judged())
+    monkeypatch.setattr(
+        "walop_jax.diagnosis.trust.examined", lambda result, *arguments: result.with_verdict()
+    )
     refit(fitted.calset, output=tmp_path / "RUN")
     assert sorted(entry.name for entry in (tmp_path / "RUN").iterdir()) == [
         "calibration.fits",

@@ -41,9 +41,9 @@ def test_so_does_that_of_a_diagnosis(monkeypatch):
 
     def note(result: Any, seed: int = 0, **more: Any) -> Any:
         seeds.append(seed)
-        return result.judged()
+        return result.with_verdict()
 
     monkeypatch.setattr(workflow, "examined", note)
-    fit = small_fit().judged()
+    fit = small_fit().with_verdict()
     workflow.diagnose(fit.calset, fit.model, catalogue=(), seed=7, minutes=0.0)
     assert set(seeds) == {7}

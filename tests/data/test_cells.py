@@ -308,7 +308,7 @@ def test_a_run_reads_its_frames_in_the_cells_of_its_fit(tmp_path):
     path, folder = tmp_path / "frames.fits", tmp_path / "run"
     write_frames(path, simulate(RUN, seed=12).calset, raster(RUN, SIDE))
     calset = read_calibration_set(path, cells=20)
-    result = fit(Likelihood.of(calset, base_model(calset, throughput_degree=2))).judged()
+    result = fit(Likelihood.of(calset, base_model(calset, throughput_degree=2))).with_verdict()
     folder.mkdir()
     write_calibration(folder / "calibration.fits", Calibration.from_fit(result))
     assert len(walop.read(folder).calset.points) == SIDE**2  # fewer pixels than the usual cells: each stays

@@ -55,7 +55,7 @@ def test_what_one_kind_has_against_the_others_the_others_have_against_it(told):
 
 def test_the_product_lies_between_and_its_errors_hold_both(told):
     result, classes = told
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     product = averaged(alone, classes)
     x, y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
     (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
@@ -71,7 +71,7 @@ def test_the_product_lies_between_and_its_errors_hold_both(told):
 def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):
     """Two ways to the same numbers: the model with all members, and the change of the matrix by each."""
     result, classes = told
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     product = averaged(alone, classes)
     at = result.calset.points.x, result.calset.points.y
     change = (product.matrix(*at)[0] - alone.matrix(*at)[0]).reshape(len(at[0]), -1)
@@ -84,7 +84,7 @@ def test_the_matrix_of_the_product_is_the_mean_of_those_of_the_members(told):
 def test_one_amplitude_of_two_kinds_is_one_parameter(told):
     """The polariser and the standards are wrong by the same: a covariance of both as two would be singular."""
     result, classes = told
-    product = averaged(Calibration.from_fit(result.judged()), classes)
+    product = averaged(Calibration.from_fit(result.with_verdict()), classes)
     clp, standard = (f"described.gain_of_O1_*_kind_{kind}" for kind in ("clp", "standard"))
     assert product.model[standard].tie == clp
     values = dict(zip(product.model.names, product.values, strict=True))
@@ -112,7 +112,7 @@ def test_sentences_in_a_fixed_ratio_have_one_error(told):
 
 def test_a_class_of_one_changes_nothing(told):
     result, _ = told
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     assert averaged(alone, Classes()) is alone
 
 
@@ -135,7 +135,7 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     assert len(group.members) == 4
     assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
     # What no member changes, the mean does not change: half-wave plates of thousands of µm, for example.
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     product = averaged(alone, Classes(additions=(group,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     for name, value, of in zip(alone.model.names, alone.values, alone.model.parameters, strict=True):
@@ -169,7 +169,7 @@ def test_a_change_of_one_name_is_not_shared_with_a_longer_description_of_it(turn
     fit = turned.result
     value, error = fit.value("hwp2_axis.angle")
     assert value == pytest.approx(0.06, abs=4 * error)
-    product = averaged(Calibration.from_fit(fit.judged()), ambiguities(turned, {"hwp2_axis": ()}))
+    product = averaged(Calibration.from_fit(fit.with_verdict()), ambiguities(turned, {"hwp2_axis": ()}))
     at = product.model.index("hwp2_axis.angle")
     assert product.values[at] == pytest.approx(value, abs=0.1 * error)
     assert np.sqrt(product.covariance[at, at]) < 3.0 * error
@@ -194,7 +194,7 @@ def test_members_that_say_a_name_in_other_words_move_its_parameter(turned):
             text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5
         ),
     )
-    alone = Calibration.from_fit(fit.judged())
+    alone = Calibration.from_fit(fit.with_verdict())
     product = averaged(alone, Classes(additions=(ClassOf("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
     assert product.model.names == alone.model.names
     place = product.model.index("hwp2_axis.angle")
@@ -218,7 +218,7 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     assert {leak, rival} <= {probe.name for probe in state.sentences}
     classes = ambiguities(state, {leak: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     product = averaged(alone, classes)
     here = [c.matrix(calset.points.x, calset.points.y)[0] for c in (alone, product)]
     np.testing.assert_allclose(here[1], here[0], atol=1e-4)
@@ -246,7 +246,7 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(spotted, monkeypatch):
     result = spotted.result
     (spots,) = ambiguities(spotted, {"blemish": [RIVAL]}).additions
     assert spots.members[0].probability >= spots.members[1].probability
-    product = averaged(Calibration.from_fit(result.judged()), Classes(additions=(spots,)))
+    product = averaged(Calibration.from_fit(result.with_verdict()), Classes(additions=(spots,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     fitted = dict(zip(result.model.names, result.values, strict=True))
     for shape in ("blemish.x", "blemish.y", "blemish.size"):
@@ -296,7 +296,7 @@ def test_the_product_is_read_as_it_was_written(told, tmp_path):
     from walop_jax.calibration.product import write_calibration
 
     result, classes = told
-    product = averaged(Calibration.from_fit(result.judged()), classes)
+    product = averaged(Calibration.from_fit(result.with_verdict()), classes)
     write_calibration(tmp_path / "calibration.fits", product)
     again = Calibration.read(tmp_path / "calibration.fits")
     assert again.content_hash() == dataclasses.replace(product, path=None).content_hash()

@@ -87,7 +87,7 @@ def test_a_deviation_changes_the_product_as_the_optics_do(described, text):
     covariance = np.zeros((count, count))
     covariance[j, j] = size**2
     shape = shape._replace(moment=covariance, slopes=np.zeros_like(shape.slopes))
-    alone = Calibration.from_fit(result.judged())
+    alone = Calibration.from_fit(result.with_verdict())
     alone = dataclasses.replace(alone, covariance=np.zeros_like(alone.covariance), hidden=None)
     x, y = np.random.default_rng(2).uniform(-0.2, 0.2, (2, 20))
     product = averaged(alone, classes._replace(shape=shape))
@@ -115,7 +115,7 @@ def test_a_deviation_larger_than_the_errors_is_not_trusted(described):
 def test_a_new_night_is_fitted_without_the_deviations(described):
     """Hundreds of parameters that act on the optics of every wavelength would take gigabytes, and mean nothing."""
     state, classes = described
-    product = averaged(Calibration.from_fit(state.result.judged()), classes)
+    product = averaged(Calibration.from_fit(state.result.with_verdict()), classes)
     assert "deviations" in product.model.effect_names
     held = [p for p in product.model.parameters if p.part == "deviations"]
     assert not any(p.free for p in held)
@@ -177,7 +177,7 @@ def test_deviations_refuse_what_they_do_not_have():
 def test_a_new_night_is_fitted_from_the_old_values(described, monkeypatch):
     """Members of a class are much alike: from zero a fit can end in another minimum, with χ²/dof 1.2 for 0.98."""
     state, _ = described
-    old = Calibration.from_fit(state.result.judged())
+    old = Calibration.from_fit(state.result.with_verdict())
     night, starts = simulate(SMALL, seed=5).calset, []
     monkeypatch.setattr(
         epoch, "fit", lambda likelihood, start: starts.append(start) or fit(likelihood, start=start)
@@ -204,7 +204,7 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     classes = ambiguities(state, {text: ()})
     assert classes.shape.on_stars == ()
     alone = classes._replace(additions=(), undetected=None)
-    product = averaged(Calibration.from_fit(state.result.judged()), alone)
+    product = averaged(Calibration.from_fit(state.result.with_verdict()), alone)
     assert "deviations" not in product.model.effect_names
 
 
@@ -218,7 +218,7 @@ def test_deviations_of_sky_light_may_depend_on_the_temperature():
     classes = ambiguities(state, {text: ()})
     laws = {change.beside_field for change in classes.shape.changes}
     assert ("kelvin",) in laws
-    product = averaged(Calibration.from_fit(state.result.judged()), classes)
-    (matrix, covariance), alone = product.matrix(0.1, 0.1), Calibration.from_fit(state.result.judged())
+    product = averaged(Calibration.from_fit(state.result.with_verdict()), classes)
+    (matrix, covariance), alone = product.matrix(0.1, 0.1), Calibration.from_fit(state.result.with_verdict())
     assert np.all(np.isfinite(matrix))
     assert np.all(np.diag(covariance) >= np.diag(alone.matrix(0.1, 0.1)[1]))

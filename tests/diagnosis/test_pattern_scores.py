@@ -9,13 +9,13 @@ import pytest
 from small_run import small_fit_with_plate
 
 from walop_jax.diagnosis.design import Design, _from_columns, _from_rows, strata
-from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.flux import FluxGroups
 
 
 def arms_apart(design: Design) -> Design:
     """As if each arm had a flux of its own: another projection of the same columns."""
     measured = design.measured
-    measured.shared = Sharing(np.kron(np.eye(2), np.ones((2, 2))))
+    measured.shared = FluxGroups(np.kron(np.eye(2), np.ones((2, 2))))
     measured.flux = np.abs(measured.flux)
     return design
 

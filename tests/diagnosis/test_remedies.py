@@ -17,7 +17,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
-def judged(calset: CalibrationSet) -> FitResult:
+def with_verdict(calset: CalibrationSet) -> FitResult:
     return examined(fit(Likelihood.of(calset, small_fit().model)))
 
 
@@ -31,7 +31,7 @@ def scattered(calset: CalibrationSet, extra: np.ndarray) -> CalibrationSet:
 def test_scintillation_is_an_error_of_the_errors():
     """0.4 % of every intensity beyond the noise of its photons: bright cameras scatter more, and nothing is missing."""
     calset = small_fit().calset
-    first = judged(scattered(calset, 0.004 * block_of(calset).counts)).warnings[0]
+    first = with_verdict(scattered(calset, 0.004 * block_of(calset).counts)).warnings[0]
     share = re.search(r"N_ERR lacks ([\d.]+) ± ([\d.]+) % of N", first)
     assert share is not None
     assert float(share[1]) == pytest.approx(0.4, abs=4 * float(share[2]))
@@ -42,7 +42,7 @@ def test_scintillation_is_an_error_of_the_errors():
 
 def test_errors_that_are_too_small_by_a_factor_are_told_as_such():
     calset = small_fit().calset
-    first = judged(scattered(calset, np.sqrt(3.0) * block_of(calset).sigma)).warnings[0]
+    first = with_verdict(scattered(calset, np.sqrt(3.0) * block_of(calset).sigma)).warnings[0]
     told = re.search(r"N_ERR is ([\d.]+) ± ([\d.]+) times too small", first)
     assert told is not None
     assert float(told[1]) == pytest.approx(2.0, abs=4 * float(told[2]))
@@ -56,7 +56,7 @@ def test_cosmic_rays_are_left_out():
     hit = rng.random(block.counts.shape[:2]) < 0.02
     counts = block.counts.copy()
     counts[..., 1] += 40.0 * hit * block.sigma[..., 1]
-    result = judged(with_block(calset, counts=counts))
+    result = with_verdict(with_block(calset, counts=counts))
     assert not result.trusted
     assert "walop-jax refit --clip 5 leaves them out" in result.warnings[0]
     assert "diagnose" not in result.warnings[0]
@@ -66,7 +66,7 @@ def test_cosmic_rays_are_left_out():
 def test_a_missing_effect_is_a_matter_of_a_diagnosis(text):
     """Its residuals have tails as well: some per cent of the rows lie far off, and leaving them out repairs nothing."""
     calset = simulate(SMALL, seed=SEED, effects=[effect_from_text(text, SMALL.context())]).calset
-    result = judged(calset)
+    result = with_verdict(calset)
     assert result.chi2 > 1.5 * result.dof
     assert "walop-jax diagnose looks for missing effects" in result.warnings[0]
     assert not any("clip" in warning for warning in result.warnings)
@@ -78,7 +78,7 @@ def test_a_number_that_the_set_states_comes_before_a_diagnosis():
     x = calset.points.x + 0.03
     points = dataclasses.replace(calset.points, x=x)
     displaced = with_block(dataclasses.replace(calset, points=points), x=x)
-    result = judged(displaced)
+    result = with_verdict(displaced)
     assert not result.explains_data
     assert "X of all field points changed by −0.0" in result.warnings[0]
     assert "diagnose" not in result.warnings[0]

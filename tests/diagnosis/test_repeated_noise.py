@@ -79,4 +79,4 @@ def test_a_copy_in_a_small_set_is_not_trusted():
     turned = dataclasses.replace(calset, exposures=e.placed(CLP=Position.at(angle)))
     found = examined(refit(with_block(turned, counts=counts, sigma=sigma)))
     assert not found.trusted
-    assert "the same noise" in "; ".join(found.verdict.doubts)
+    assert "the same noise" in "; ".join(found.verdict.residual_doubts)

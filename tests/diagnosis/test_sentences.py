@@ -59,7 +59,7 @@ def test_a_film_whose_axis_turns_over_the_field():
     assert result.verdict == "effect_found"
     assert [step.effect for step in result.steps] == ["described"]
     ((change, value, sigma),) = result.steps[0].descriptions
-    assert (change.kind, change.where, change.place) == ("turn", "of", "polariser")
+    assert (change.kind, change.relation, change.place) == ("turn", "of", "polariser")
     assert change.text == "turn of polariser * x"
     assert value == pytest.approx(0.05, abs=4 * sigma)
     assert change.tested_by
@@ -82,7 +82,9 @@ def test_halves_that_are_vignetted_differently():
     result = found([Vignetting()])
     names = {step.effect for step in result.steps}
     assert names <= {"described"}
-    places = {f"{change.where} {change.place}" for step in result.steps for change, _, _ in step.descriptions}
+    places = {
+        f"{change.relation} {change.place}" for step in result.steps for change, _, _ in step.descriptions
+    }
     assert result.verdict == "unexplained" or places == {"of half1"} or places == {"of half2"}
 
 

@@ -24,11 +24,11 @@ from walop_jax.diagnosis import stated_conditions as conditions
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.detection_limits import condition_limits
-from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.readings import with_places
 from walop_jax.diagnosis.remainder import instead_of_names, rival_conditions
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores, stated_conditions
 from walop_jax.diagnosis.trust import examined
+from walop_jax.diagnosis.undetected_errors import undetected_errors
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit, refit
 from walop_jax.fit.verdict import Hidden
@@ -43,7 +43,7 @@ from walop_jax.simulation.simulate import effect_from_text, simulate
 def told_of(result: FitResult, start: str = "the residuals ask for ") -> str:
     """The one doubt that begins so, of a fit that is not trusted."""
     assert not result.trusted
-    (told,) = [text for text in result.verdict.doubts if text.startswith(start)]
+    (told,) = [text for text in result.verdict.residual_doubts if text.startswith(start)]
     return told
 
 
@@ -173,7 +173,7 @@ def test_sky_left_over_in_twenty_sets_and_in_no_sound_one():
     for seed in range(100, 120):
         plain = simulate(SMALL, seed=seed).calset
         assert examined(refit(under_sky(plain, 0.0))).trusted
-        first = examined(refit(under_sky(plain, 0.01))).verdict.doubts[0]
+        first = examined(refit(under_sky(plain, 0.01))).verdict.residual_doubts[0]
         value, error = number(first, "residuals ask for .* units of SKY,")
         pulls.append((value - 0.01) / error)
     assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.4
@@ -326,7 +326,7 @@ def test_a_number_that_explains_little_of_a_fit_far_off_is_not_told():
 def test_what_could_hide_is_ranked_by_what_it_does_to_stars():
     """In the order of the protection level over the field, each by itself, not of how far parameters move."""
     design = Design.of(small_fit())
-    hidden = hidden_mistakes(design, Singles.of(design))
+    hidden = undetected_errors(design, Singles.of(design))
     calibration = Calibration.from_fit(small_fit())
     x, y = small_fit().calset.points.x, small_fit().calset.points.y
     seen = []

@@ -82,7 +82,7 @@ def clean(plain) -> FitResult:
 
 def test_a_fit_of_what_the_model_describes_is_trusted(clean):
     assert clean.trusted
-    assert clean.verdict == dataclasses.replace(clean.verdict, against=())
+    assert clean.verdict == dataclasses.replace(clean.verdict, doubts=())
 
 
 @pytest.mark.long
@@ -94,7 +94,7 @@ def test_a_lamp_of_another_temperature(calset):
     found = refit(dataclasses.replace(warm, exposures=dataclasses.replace(warm.exposures, teff=said)))
     assert found.explains_data
     assert not found.trusted
-    assert "TEFF of exposures of kind clp" in found.verdict.doubts[0]
+    assert "TEFF of exposures of kind clp" in found.verdict.residual_doubts[0]
 
 
 MISTAKES = {
@@ -125,7 +125,7 @@ def test_chi2_a_few_per_cent_too_large_is_trusted_only_without_doubts(clean):
     def found(ratio: float, *doubts: str) -> FitResult:
         data = 1e4 * ratio - (clean.chi2 - clean.expansion.data)
         expansion = dataclasses.replace(clean.expansion, data=data, dof=10_000)
-        return dataclasses.replace(clean, expansion=expansion).judged(doubts)
+        return dataclasses.replace(clean, expansion=expansion).with_verdict(doubts)
 
     assert found(1.1).chi2 == pytest.approx(11_000)
     cases = [
@@ -154,9 +154,9 @@ def test_a_fit_that_nobody_examined_has_no_verdict(clean):
 @given(st.lists(st.builds(Doubt, st.sampled_from(Quality), st.text(max_size=5), st.booleans())), st.data())
 def test_adding_a_doubt_never_makes_trusted(doubts, data):
     """Bits and sentences only grow, a verdict that is not trusted stays so, and a file gives the same."""
-    verdict = Verdict(1.0, 1, 16, 1.0, converged=True, against=tuple(doubts))
+    verdict = Verdict(1.0, 1, 16, 1.0, converged=True, doubts=tuple(doubts))
     more = data.draw(st.builds(Doubt, st.sampled_from(Quality), st.text(max_size=5), st.booleans()))
-    worse = dataclasses.replace(verdict, against=(*doubts, more))
+    worse = dataclasses.replace(verdict, doubts=(*doubts, more))
     assert worse.trusted <= verdict.trusted
     assert worse.trusted == (verdict.trusted and not more.blocking)
     assert worse.quality == verdict.quality | more.bit
@@ -182,7 +182,7 @@ def test_errors_a_few_per_cent_off_are_no_matter_of_the_model():
     found = refit(with_block(calset, sigma=0.93 * block_of(calset).sigma))
     assert not found.explains_data
     assert found.trusted
-    assert found.verdict.doubts == ()
+    assert found.verdict.residual_doubts == ()
     assert "% too small" in found.warnings[0]
     ratio = np.median(found.sigma[found.sigma > 0] / clean.sigma[clean.sigma > 0])
     assert 1.0 < ratio < 1.5
@@ -196,7 +196,7 @@ def test_structure_finer_than_the_cells_of_frames_is_told_and_in_the_errors_of_s
     assert clean.trusted
     assert not found.trusted
     told = "residuals of the same pixel agree between exposures: structure of 0.0008, finer than the cells"
-    assert any(text.startswith(told) for text in found.verdict.doubts)
+    assert any(text.startswith(told) for text in found.verdict.residual_doubts)
     assert found.verdict.structure.gain == pytest.approx(gain)
     made = Calibration.from_fit(found).matrix(np.array([0.1]), np.array([0.1]))[1]
     assert np.sqrt(made[0, 0, 0]) > 0.6 * gain  # (N₁ − N₂)/(N₁ + N₂) of gains that differ by √2 of it

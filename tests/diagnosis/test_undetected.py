@@ -44,7 +44,7 @@ def sound():
 
 
 def product_of(result, shape) -> Calibration:
-    return averaged(Calibration.from_fit(result.judged()), Classes(undetected=shape))
+    return averaged(Calibration.from_fit(result.with_verdict()), Classes(undetected=shape))
 
 
 def test_second_moments_are_those_of_the_mixture():
@@ -83,7 +83,7 @@ def test_few_columns_carry_a_covariance():
 def test_values_stay_and_offsets_keep_their_errors(sound):
     """Of a sound set: diattenuation shows in every exposure, polarisation ahead of the polariser hardly does."""
     result, shape, _ = sound
-    alone, product = Calibration.from_fit(result.judged()), product_of(result, shape)
+    alone, product = Calibration.from_fit(result.with_verdict()), product_of(result, shape)
     x, y = np.random.default_rng(1).uniform(-0.2, 0.2, (2, 30))
     (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
     np.testing.assert_allclose(m, one, rtol=0, atol=1e-13)
@@ -103,7 +103,7 @@ def test_what_is_hidden_lies_within_the_errors():
     plan = plan_for_settings(simulation.truth, setting, calset.filters)
     true = planned_matrices(simulation.truth, plan, points.x, points.y).reshape(len(points.x), 6)
     worst = []
-    for product in (Calibration.from_fit(result.judged()), product_of(result, shape)):
+    for product in (Calibration.from_fit(result.with_verdict()), product_of(result, shape)):
         m, c = product.matrix(points.x, points.y, setting)
         pulls = np.abs(m - true) / np.sqrt(np.diagonal(c, axis1=1, axis2=2))
         worst.append(np.median(pulls, axis=0).max())

@@ -108,7 +108,9 @@ def rough():
 
 def test_structure_is_told_with_its_size(rough):
     assert not rough.trusted
-    assert "residuals of the same field point agree between exposures" in "; ".join(rough.verdict.doubts)
+    assert "residuals of the same field point agree between exposures" in "; ".join(
+        rough.verdict.residual_doubts
+    )
     assert rough.verdict.structure.gain == pytest.approx(1e-3, rel=0.3)
 
 

@@ -71,7 +71,7 @@ def test_bad_data_cost_no_more_passes_than_they_are_worth(mistake, passes):
     model, told = base_model(calset), []
     result = refit(calset, model, progress=told.append)
     assert passes[0] <= most_passes(model)
-    assert not result.judged().trusted
+    assert not result.with_verdict().trusted
     assert result.chi2 > FAR_OFF * result.dof
     assert result.converged or "walop-jax diagnose" in result.minimum.message
     steps = [line for line in told if "step" in line]

@@ -75,7 +75,7 @@ def test_scintillation_of_one_camera_is_found_where_it_is():
     for name in ("noise.fraction_O1", "noise.fraction_O2", "noise.fraction_E2"):
         value, error = found.value(name)
         assert abs(value) < 4.0 * error, name
-    (told,) = (text for text in found.judged().warnings if "errors of the data were fitted" in text)
+    (told,) = (text for text in found.with_verdict().warnings if "errors of the data were fitted" in text)
     assert "noise.fraction_E1 = 0.00" in told
 
 
@@ -120,11 +120,13 @@ def test_a_model_file_says_what_is_fitted(tmp_path: Path):
 
 
 def test_a_calibration_carries_them(tmp_path: Path):
-    found = fitted(small_fit().calset, scale="all").judged()
+    found = fitted(small_fit().calset, scale="all").with_verdict()
     write_calibration(tmp_path / "c.fits", Calibration.from_fit(found))
     back = read_calibration(tmp_path / "c.fits")
     assert back["noise.scale"].value == found["noise.scale"].value
-    matrix, plain = (Calibration.from_fit(one).matrix(0.1, -0.1)[0] for one in (found, small_fit().judged()))
+    matrix, plain = (
+        Calibration.from_fit(one).matrix(0.1, -0.1)[0] for one in (found, small_fit().with_verdict())
+    )
     np.testing.assert_allclose(back.matrix(0.1, -0.1)[0], matrix, atol=1e-14)
     np.testing.assert_allclose(matrix, plain, atol=1e-4)
 

@@ -100,7 +100,7 @@ def test_cameras_that_are_exchanged_are_no_outliers(clean):
     swapped = TableIntensities.dense(clean.points, clean.intensities.block(0, len(clean.points)))
     swapped.counts[:], swapped.sigma[:] = table.counts[:, order], table.sigma[:, order]
     found = clipped(dataclasses.replace(clean, intensities=swapped))
-    verdict = found.judged().verdict
+    verdict = found.with_verdict().verdict
     assert not verdict.trusted
     assert any("the fit is poor" in text for text in verdict.warnings)
 
@@ -147,7 +147,7 @@ def test_a_run_that_is_made_anew_without_clipping_forgets_the_rows(spoilt_run, t
     _, _, _, result = spoilt_run
     result.save(tmp_path / "RUN")
     assert len(Table.read(tmp_path / "RUN" / "clipped.ecsv")) == len(result.clipped)
-    small_fit().judged().save(tmp_path / "RUN", overwrite=True)
+    small_fit().with_verdict().save(tmp_path / "RUN", overwrite=True)
     assert not (tmp_path / "RUN" / "clipped.ecsv").exists()
 
 

@@ -92,7 +92,7 @@ def test_exposures_with_a_disturbance_of_their_own(clean, tmp_path):
     assert np.abs(pulls(result, true)).max() < 4.5
     assert 0.3 < np.sqrt(np.mean(pulls(result, true) ** 2)) < 1.3
 
-    write_calibration(tmp_path / "calibration.fits", Calibration.from_fit(result.judged()))
+    write_calibration(tmp_path / "calibration.fits", Calibration.from_fit(result.with_verdict()))
     product = read_calibration(tmp_path / "calibration.fits")
     assert product.verdict.errors_from == result.errors_from
     [check] = [check for check in certify(product) if check.name == "covariance"]

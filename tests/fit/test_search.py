@@ -13,7 +13,7 @@ from walop_jax.fit.minimise import TOLERANCE
 from walop_jax.fit.model_file import model_without_data
 from walop_jax.fit.search import _order_starts, _search, find_minimum
 from walop_jax.instruments.description import parsed
-from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood, OpticsUsed
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, OpticsUsed, UsedData
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import build
@@ -118,9 +118,9 @@ def test_a_search_ends_with_equal_plates_wherever_it_began(north, monkeypatch):
     def expand(values, scale, near):
         seen.append(values)
         away = values[model.free] - goal
-        census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
+        used_data = UsedData(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
         square = float(away @ away)
-        return Expansion(square, 0.0, 0.0, scale, away, np.eye(len(away)), census, 1, OpticsUsed(None))
+        return Expansion(square, 0.0, 0.0, scale, away, np.eye(len(away)), used_data, 1, OpticsUsed(None))
 
     first = model.start.copy()
     for i, _ in ties(model):
@@ -169,8 +169,8 @@ def test_fringes_of_another_order_are_no_end(start, monkeypatch):
         gradient[at] += jacobian.T @ residual
         matrix = others.copy()
         matrix[np.ix_(at, at)] += jacobian.T @ jacobian
-        census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
-        return Expansion(square, 0.0, 0.0, scale, gradient, matrix, census, DOF, OpticsUsed(None))
+        used_data = UsedData(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 4)
+        return Expansion(square, 0.0, 0.0, scale, gradient, matrix, used_data, DOF, OpticsUsed(None))
 
     monkeypatch.setattr(Likelihood, "expand", expand)
     assert model.gaps() == (model.index("etalon.gap"),)

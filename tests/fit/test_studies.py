@@ -85,7 +85,7 @@ def study(plan: ObservingPlan, seeds: Sequence[int]) -> Study:
     for seed in seeds:
         calset, truth = simulate(plan, seed)
         result = refit(calset)
-        assert result.judged().trusted, result.warnings
+        assert result.with_verdict().trusted, result.warnings
         free = result.model.free
         names = tuple(result.model.names[i] for i in free)
         pulls.append((result.values - np.asarray(values_of(truth)))[free] / result.sigma[free])
@@ -173,4 +173,4 @@ def test_a_study_can_fail():
     # A model that cannot follow the optics is not trusted, so the study would stop.
     calset, _ = simulate(SMALL, 6)
     result: FitResult = refit(calset, base_model(calset, plates="fixed_axis"))
-    assert not result.judged().trusted
+    assert not result.with_verdict().trusted

@@ -98,17 +98,17 @@ def _fold(off: dict[str, np.ndarray], number: int) -> list[np.ndarray]:
 
 
 def test_the_same_instrument_still_fits_and_a_turned_derotator_does_not(fitted, table):
-    old = Calibration.from_fit(fitted.judged())
+    old = Calibration.from_fit(fitted.with_verdict())
     noisy = table.copy()
     noisy["N"] = (
         table["N"]
         + np.random.default_rng(0).normal(0.0, 1e-3, table["N"].shape) * table["N"].mean(axis=1)[:, None]
     )
-    same = epoch(old, fit_like(old, charis_set(noisy)).judged())
+    same = epoch(old, fit_like(old, charis_set(noisy)).with_verdict())
     assert same.fits
     turned = table.copy()
     turned["ROTATOR_ANGLE"] = table["ROTATOR_ANGLE"] + 0.5
-    new = fit_like(old, charis_set(turned)).judged()
+    new = fit_like(old, charis_set(turned)).with_verdict()
     other = epoch(old, new)
     assert not other.fits
     assert new.values[new.model.index("derotator.axis")] - fitted.value("derotator.axis")[0] == pytest.approx(

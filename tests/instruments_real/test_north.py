@@ -82,7 +82,9 @@ def test_squares_of_a_checkerboard_that_were_left_out(run, calset):
     x, y = calset.points.x, calset.points.y
     outside = (np.floor((x + 0.25) / 0.125) + np.floor((y + 0.25) / 0.125)) % 2 == 0
     kept = part(calset, points=~outside)
-    found = Calibration.from_fit(fit(Likelihood.of(kept, started(made.result)), noise_scale=1.5).judged())
+    found = Calibration.from_fit(
+        fit(Likelihood.of(kept, started(made.result)), noise_scale=1.5).with_verdict()
+    )
     assert rms(off(found, calset)[outside]) < 1.3 * rms(off(calibration, calset))
 
 
@@ -90,7 +92,9 @@ def test_a_wavelength_that_was_left_out(run, calset):
     made, calibration = run
     number = 3  # 0.62 um
     kept = part(calset, wavelength=colours(calset)[number])
-    found = Calibration.from_fit(fit(Likelihood.of(kept, started(made.result)), noise_scale=1.5).judged())
+    found = Calibration.from_fit(
+        fit(Likelihood.of(kept, started(made.result)), noise_scale=1.5).with_verdict()
+    )
     assert rms(off(found, calset)[:, number]) < 1.3 * rms(off(calibration, calset))
 
 

@@ -278,7 +278,10 @@ def test_batches_change_nothing(block, likelihood, values):
     batched = likelihood_of(block, batch=3)
     assert len(batched.points) == 3
     same(batched.expand(values), likelihood.expand(values))
-    assert (batched.independent, batched.census.n_data) == (likelihood.independent, likelihood.census.n_data)
+    assert (batched.independent, batched.used_data.n_data) == (
+        likelihood.independent,
+        likelihood.used_data.n_data,
+    )
 
 
 def test_order_of_points_and_exposures_changes_nothing(block, likelihood, values):
@@ -301,7 +304,7 @@ def test_row_that_is_not_used_is_as_good_as_removed(block, values):
         changed(block, **{name: getattr(block, name)[:, keep] for name in names}), [ROWS[i] for i in keep]
     )
     same(masked.expand(values), removed.expand(values))
-    assert (masked.independent, masked.census.n_data) == (removed.independent, removed.census.n_data)
+    assert (masked.independent, masked.used_data.n_data) == (removed.independent, removed.used_data.n_data)
     flux, residual = masked.residuals(values)
     np.testing.assert_array_equal(residual[:, gone], 0.0)
     assert np.isfinite(flux).all()
@@ -331,7 +334,7 @@ def test_independent_data(block, likelihood):
     rows = block.used.sum()
     flux_rows = block.used[:, -1].sum()
     priors = 3 + 2 + 2 + 8 + 4  # collimator, calibration plate, pupil, each half four, two standards
-    assert likelihood.census.n_data == 4 * rows
+    assert likelihood.used_data.n_data == 4 * rows
     assert likelihood.independent == 3 * rows + flux_rows + priors
 
 
@@ -380,4 +383,4 @@ def test_set_a_has_the_oracles_residuals(either_south_set, start):
     expansion = likelihood.expand(vector)
     assert expansion.data == pytest.approx(np.sum(expected[:rows] ** 2), rel=1e-6)
     assert expansion.priors == pytest.approx(np.sum(expected[rows:] ** 2), rel=1e-10)
-    assert likelihood.census.n_data == rows
+    assert likelihood.used_data.n_data == rows

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.flux import FluxGroups
 from walop_jax.likelihood.noise import NoiseTerms, log_variance, noise_expansion, variance_ratio
 from walop_jax.model.compiled import array
 from walop_jax.model.noise import Noise
@@ -25,7 +25,7 @@ POINTS = 3
 class Scene:
     """Counts, models for light of unit flux and stated errors of a few points, drawn once."""
 
-    def __init__(self, shared: Sharing) -> None:
+    def __init__(self, shared: FluxGroups) -> None:
         rng = np.random.default_rng(4)
         shape = (POINTS, len(KINDS), len(CAMERAS))
         self.shared = shared
@@ -82,9 +82,9 @@ class Scene:
 
 
 SHARINGS = {
-    "a flux for each exposure": Sharing(),
-    "a flux for each arm": Sharing(cameras=BY_ARM),
-    "lamps of one flux": Sharing(exposures=GROUPS),
+    "a flux for each exposure": FluxGroups(),
+    "a flux for each arm": FluxGroups(cameras=BY_ARM),
+    "lamps of one flux": FluxGroups(exposures=GROUPS),
 }
 TERMS = {
     "one scale": ((("all",), ()), [1.4]),
@@ -154,7 +154,7 @@ def test_its_gradient_is_that_of_finite_differences(scene: Scene, name: str):
 def test_its_matrix_is_the_covariance_of_its_gradient_over_noise(name: str):
     """Fisher's information is the covariance of half the gradient of −2 ln L, over draws of the data."""
     groups, values = TERMS[name]
-    scene, rng, here = Scene(Sharing()), np.random.default_rng(1), np.array(values)
+    scene, rng, here = Scene(FluxGroups()), np.random.default_rng(1), np.array(values)
     scene.unit[:, FLUX_KNOWN] *= 1e4
     noise, truth = noise_at(groups, here), 1e4 * scene.unit / np.where(FLUX_KNOWN, 1e4, 1.0)[None, :, None]
     scene.counts = truth.copy()
@@ -185,7 +185,7 @@ def test_its_matrix_is_the_covariance_of_its_gradient_over_noise(name: str):
 
 def test_one_scale_of_all_errors_is_that_of_the_scatter():
     """s² = χ²/(n − n_F) and its error s/√(2 (n − n_F)); with p parameters, of n data, s² = χ²/(n − n_F − p)."""
-    scene, groups = Scene(Sharing()), (("all",), ())
+    scene, groups = Scene(FluxGroups()), (("all",), ())
     one = np.ones_like(scene.counts)
     chi2 = float(np.sum(scene.residual(one) ** 2))
     used = scene.weight > 0

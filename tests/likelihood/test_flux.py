@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.likelihood.inverses import of_low_rank
 
 
@@ -57,7 +57,7 @@ GROUPS = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # the first two exposur
 def test_every_arm_has_a_flux_of_its_own():
     counts = np.array([[2.0, 4.0, 30.0, 60.0]])
     flux, left = eliminate_flux(
-        counts, np.array([[1.0, 2.0, 1.0, 2.0]]), np.array([False]), Sharing(TOGETHER)
+        counts, np.array([[1.0, 2.0, 1.0, 2.0]]), np.array([False]), FluxGroups(TOGETHER)
     )
     np.testing.assert_allclose(flux, [[2.0, 2.0, 30.0, 30.0]], rtol=1e-14)
     np.testing.assert_allclose(left, 0.0, atol=1e-13)
@@ -67,7 +67,7 @@ def test_exposures_of_a_group_share_the_flux_of_an_arm():
     """Arm 1 of exposures 1 and 2: F = (1·1 + 0·1 + 3·2 + 1·0) / (1 + 1 + 4 + 0) = 7/6."""
     model = np.array([[1.0, 1.0, 1.0, 1.0], [2.0, 0.0, 1.0, 3.0], [1.0, 1.0, 2.0, 2.0]])
     counts = np.array([[1.0, 0.0, 2.0, 2.0], [3.0, 1.0, 2.0, 6.0], [5.0, 5.0, 1.0, 3.0]])
-    shared = Sharing(TOGETHER, GROUPS)
+    shared = FluxGroups(TOGETHER, GROUPS)
     flux, left = eliminate_flux(counts, model, np.zeros(3, bool), shared)
     np.testing.assert_allclose(flux[:, 0], [7 / 6, 7 / 6, 5.0], rtol=1e-14)
     np.testing.assert_allclose(flux[:, 2], [2.0, 2.0, 1.0], rtol=1e-14)
@@ -83,7 +83,7 @@ def test_what_a_shared_flux_can_follow_is_taken_out_and_nothing_else():
     ]
     a = np.stack(fluxes, axis=1)
     expected = columns.reshape(2, -1) @ (np.eye(12) - a @ np.linalg.pinv(a))
-    found = project_flux(columns, along, np.zeros(3, bool), Sharing(TOGETHER, GROUPS))
+    found = project_flux(columns, along, np.zeros(3, bool), FluxGroups(TOGETHER, GROUPS))
     np.testing.assert_allclose(found.reshape(2, -1), expected, rtol=0, atol=1e-13)
 
 
@@ -92,7 +92,7 @@ def test_what_exposures_have_in_common_is_taken_out_of_their_covariance():
     rng = np.random.default_rng(4)
     responses = rng.normal(size=(3, 5, 4, 2)) * np.array([1e-3, 30.0])
     responses[2] = 0.0
-    shared = Sharing(stars=of_low_rank(responses))
+    shared = FluxGroups(stars=of_low_rank(responses))
     values = rng.normal(size=(7, 3, 5, 4))
     found = shared.independent(values)
     for point in range(3):

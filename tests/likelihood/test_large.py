@@ -63,7 +63,7 @@ def test_the_fit_of_a_large_set_ends_where_the_usual_one_ends(large, fitted):
     # The matrix is that of the place before the last step.
     np.testing.assert_allclose(found.sigma, fitted.sigma, rtol=5e-3)
     assert (found.dof, found.n_data) == (fitted.dof, fitted.n_data)
-    assert found.expansion.census.field == made_field(large)
+    assert found.expansion.used_data.field == made_field(large)
 
 
 def made_field(likelihood):

@@ -90,11 +90,11 @@ def test_expansion_and_counts_agree(calset, counted):
     np.testing.assert_array_equal(a.matrix, b.matrix)
     # What an expansion has counted on its way is what a pass of its own counts.
     for found in (a, b):
-        np.testing.assert_array_equal(found.census.rows, one.census.rows)
-        assert (found.n_data, found.dof) == (other.census.n_data, a.dof)
+        np.testing.assert_array_equal(found.used_data.rows, one.used_data.rows)
+        assert (found.n_data, found.dof) == (other.used_data.n_data, a.dof)
     assert a.n_data == 4 * other.used.sum() == 4 * calset.intensities.rows
     x, y = calset.points.x, calset.points.y
-    assert a.census.field == one.census.field == (x.min(), x.max(), y.min(), y.max())
+    assert a.used_data.field == one.used_data.field == (x.min(), x.max(), y.min(), y.max())
 
 
 def test_a_fault_in_the_file_stops_the_pass(calset, counted):

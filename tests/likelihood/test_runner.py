@@ -74,7 +74,7 @@ EXPAND = """
 from test_runner import made
 p = made()
 found = p.expand(p.model.start)
-print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows": found.census.rows.tolist(),
+print(json.dumps({"devices": jax.local_device_count(), "data": found.data, "rows": found.used_data.rows.tolist(),
                   "gradient": found.gradient.tolist(), "matrix": found.matrix.tolist()}))
 """
 
@@ -129,7 +129,7 @@ def test_progress_counts_every_point_once(likelihood, monkeypatch):
 
 def test_short_passes_are_not_told_of(likelihood):
     told = []
-    assert dataclasses.replace(likelihood, runner=Runner(progress=told.append)).census.n_data
+    assert dataclasses.replace(likelihood, runner=Runner(progress=told.append)).used_data.n_data
     assert told == []
 
 

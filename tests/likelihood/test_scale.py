@@ -149,7 +149,7 @@ def test_cost_per_iteration():
         likelihood = Likelihood.of(calset, base_model(calset))
         values = likelihood.model.start
         near = likelihood.expand(values)  # compiles; fills the memory where the set is kept
-        data = seconds(lambda likelihood=likelihood: dataclasses.replace(likelihood).census)
+        data = seconds(lambda likelihood=likelihood: dataclasses.replace(likelihood).used_data)
         full = seconds(lambda likelihood=likelihood, values=values: likelihood.expand(values))
         rows.append((side**2, data, full))
         print(
@@ -192,7 +192,7 @@ def test_whole_frames(tmp_path, side):
 def matrix_error(calset, truth, result) -> tuple[float, float]:
     """Rms error of the elements of the matrix at places between the points, and what the covariance expects."""
     x, y = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.23, 0.23, 11)] * 2))
-    calibration = Calibration.from_fit(result.judged())
+    calibration = Calibration.from_fit(result.with_verdict())
     found, covariance = calibration.matrix(x, y)
     plan = plan_for_settings(truth, Settings.default(1), calset.filters)
     exact = instrument_matrix(jnp.asarray(analysis_vectors(truth, plan, x, y)[:, 0]), truth.cameras.pairs)

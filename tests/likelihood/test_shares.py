@@ -48,7 +48,9 @@ def likelihood_of(
         ),
     )  # fmt: skip
     south = nominal_instrument("WALOP-SOUTH")
-    south = dataclasses.replace(south, cameras=dataclasses.replace(south.cameras, split=split, floor=floor))
+    south = dataclasses.replace(
+        south, cameras=dataclasses.replace(south.cameras, split=split, noise_floor=floor)
+    )
     return Likelihood.of(calset, base_model(calset, south, throughput_degree=1))
 
 

@@ -278,7 +278,13 @@ def test_no_more_enters_the_optics_than_has_to(kind):
     """What acts behind the polariser but ahead of the pupil, and in the cameras, costs no optics."""
     found = optical_names(scenes.instrument(kind.neutral(scenes.CONTEXT)))
     own = [f"{kind.name}.{name}" for name in OPTICAL.get(kind.name, [])]
-    assert sorted(found) == sorted([*BASE, *own])
+    assert set(found) - {*BASE, *own} == set(), (
+        f"is that needed? then add these numbers to OPTICAL in {__file__}"
+    )
+    assert {*BASE, *own} - set(found) == set(), (
+        f"these enter no optics: take them out of OPTICAL in {__file__}"
+    )
+    assert len(found) == len(set(found))
 
 
 def test_effects_that_nobody_knows_enter_the_optics():

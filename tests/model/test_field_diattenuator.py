@@ -107,7 +107,7 @@ def test_ahead_of_an_analyser_it_is_a_ratio_of_the_beams():
     matrix = element.mueller(ray(0.0, 0.0, 0.6))
     assert matrix is not None
     analyser = Analyser()
-    beams = np.asarray(analyser.shares() @ analyser.seen(matrix[0]))
+    beams = np.asarray(analyser.beam_weights() @ analyser.seen(matrix[0]))
     np.testing.assert_allclose(beams[:, 0], [0.6, 0.4], rtol=1e-14)
     np.testing.assert_allclose(beams @ [1.0, 1.0, 0.0, 0.0], [1.2, 0.0], atol=1e-15)
 
@@ -115,7 +115,7 @@ def test_ahead_of_an_analyser_it_is_a_ratio_of_the_beams():
 def test_beams_of_unequal_efficiency():
     """η = 0.9, ξ = 0.05: ½ (1, 0.95, 0, 0) and ½ (1, −0.85, 0, 0)."""
     analyser = Analyser(efficiency=0.9, contrast=0.05)  # pyright: ignore
-    beams = np.asarray(analyser.shares() @ analyser.seen(jnp.eye(4)))
+    beams = np.asarray(analyser.beam_weights() @ analyser.seen(jnp.eye(4)))
     np.testing.assert_allclose(beams, [[0.5, 0.475, 0.0, 0.0], [0.5, -0.425, 0.0, 0.0]], atol=1e-15)
 
 
@@ -137,14 +137,14 @@ def test_a_description_with_ties_shares_and_a_floor():
     assert instrument.elements[1].position(None) == 0.0
     assert instrument.cameras.fluxes == 2
     np.testing.assert_array_equal(instrument.cameras.together, np.kron(np.eye(2), np.ones((2, 2))))
-    assert instrument.cameras.floor == 0.01
+    assert instrument.cameras.noise_floor == 0.01
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ("split = true", "split = 1", "split = 1 must be true or false"),
-        ("floor = 0.01", "floor = 1.5", "share of the light"),
+        ("floor = 0.01", "floor = 1.5", "fraction of the light"),
         ("always_in = true", "always_in = 1.0", "must be true or false"),
         ("none_at = 0.6", "none_at = 0.5", "none_at"),
     ],

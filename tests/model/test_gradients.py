@@ -14,7 +14,7 @@ from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import leaves, values_of, with_values
 from walop_jax.model.planning import plan_for
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 
 STANDARDS = [("STAR", 0.04, -0.02)]
 LAM = 0.63
@@ -47,7 +47,9 @@ def model(values, x, y):
     rows = light.band_rows(instrument, PLAN, x, y)
     band = jnp.asarray(PLAN.band_of)[jnp.arange(4), SOURCE + 1]
     throughput = instrument.throughput.at(x, y)
-    return light.counts(instrument, rows, throughput, Sight(PLAN.exposures, SKY, SOURCE, x, y), band).ravel()
+    return light.counts(
+        instrument, rows, throughput, PointIllumination(PLAN.exposures, SKY, SOURCE, x, y), band
+    ).ravel()
 
 
 counts, forward_jacobian, reverse_jacobian = map(compiled, (model, jax.jacfwd(model), jax.jacrev(model)))

@@ -14,7 +14,7 @@ from walop_jax.io.errors import DataError
 from walop_jax.model import light
 from walop_jax.model.instrument import build, nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 
 SETTINGS = (None, 0.0, 45.0)
 FLIP_V = np.array([1.0, 1.0, 1.0, -1.0])  # the oracle's V is 2 Im Ex* Ey, the package's 2 Im Ex Ey*
@@ -197,8 +197,10 @@ def test_lenses_ahead_of_the_polariser_act_on_the_sky_alone():
         {"kind": "standard", "rotator": 0.0}, {"clp_angle": 0.0}, {"kind": "flux"}, {"kind": "moon"}
     )
     arrays = plan_for(instrument, rows, {"band": builders.monochromatic(0.62)}).exposures
-    sight = Sight(arrays, jnp.zeros((4, 2)), jnp.full(4, -1), jnp.asarray(0.2), jnp.asarray(0.1))
-    found = light.stokes(instrument, sight)
+    illumination = PointIllumination(
+        arrays, jnp.zeros((4, 2)), jnp.full(4, -1), jnp.asarray(0.2), jnp.asarray(0.1)
+    )
+    found = light.stokes(instrument, illumination)
     c = (1 - 2e-5) / (1 + 2e-5)
     expected = [[1, 0.024, 0.032, 0], [1, c, 0, 0], [1, 0, 0, 0], [1, 0.024, 0.032, 0]]
     np.testing.assert_allclose(found, expected, atol=1e-15)

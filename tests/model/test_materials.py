@@ -15,7 +15,7 @@ from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import parsed
 from walop_jax.io.errors import DataError
-from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood, OpticsUsed
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, OpticsUsed, UsedData
 from walop_jax.model import materials
 from walop_jax.model.instrument import build
 from walop_jax.model.planning import extrapolations, plan_for_settings
@@ -142,13 +142,13 @@ def test_a_fit_says_so_and_is_not_forbidden():
         instrument="INFRARED", filters={"K": curve}, filter="K",
     )  # fmt: skip
     likelihood = Likelihood.of(calset, model_for(calset, "", instrument))
-    census = Census(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 2)
+    used_data = UsedData(np.ones(4, int), (0.0, 0.1, 0.0, 0.1), 2)
     n = len(likelihood.model.free)
-    expansion = Expansion(5.0, 0.0, 0.0, 1.0, np.zeros(n), np.eye(n), census, 5, OpticsUsed(None))
+    expansion = Expansion(5.0, 0.0, 0.0, 1.0, np.zeros(n), np.eye(n), used_data, 5, OpticsUsed(None))
     minimum = minimise(lambda x: expansion, np.zeros(n), np.ones(n))
     size = len(likelihood.model.names)
     result = FitResult(
         likelihood, likelihood.model.start, np.zeros((size, size)), expansion, minimum, seconds=0.0
-    ).judged()
+    ).with_verdict()
     assert any("quartz was measured at 0.198 to 2.05 µm" in text for text in result.warnings)
     assert result.trusted

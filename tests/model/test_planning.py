@@ -16,7 +16,7 @@ from walop_jax.model.effects.base import Scalar
 from walop_jax.model.elements.base import Element
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import number, param
-from walop_jax.model.planning import SMOOTH_NODES, nodes_for, plan_for, shares_of_points
+from walop_jax.model.planning import SMOOTH_NODES, nodes_for, plan_for, weights_of_points
 
 CURVE = {"band": builders.curve([0.59, 0.62, 0.65], [1.0, 1.0, 1.0])}
 DEVICE = nominal_instrument()
@@ -106,7 +106,7 @@ def test_shares_are_those_of_polynomials():
     """Any polynomial of seventh degree in one condition, times any function of three values of another, is exact."""
     hours = RNG.uniform(-3.0, 9.0, 100)
     moments = [(float(t), float(k)) for t in hours for k in (1.0, 2.0, 5.0)]
-    shares = shares_of_points(moments, [SMOOTH_NODES, SMOOTH_NODES])
+    shares = weights_of_points(moments, [SMOOTH_NODES, SMOOTH_NODES])
     assert len(set().union(*shares.values())) == 3 * SMOOTH_NODES
     coefficients = RNG.standard_normal(SMOOTH_NODES)
     for (t, k), of_points in list(shares.items())[::17]:
@@ -121,20 +121,20 @@ def test_shares_are_those_of_polynomials():
 @pytest.mark.parametrize("moments", [[()], [(1.0,), (4.0,)], [(float(t),) for t in range(SMOOTH_NODES)]])
 def test_few_moments_are_followed_one_by_one(moments):
     alone = {moment: {moment: 1.0} for moment in moments}
-    assert shares_of_points(moments, [SMOOTH_NODES] * len(moments[0])) == alone
+    assert weights_of_points(moments, [SMOOTH_NODES] * len(moments[0])) == alone
 
 
 def test_a_moment_without_a_value_leaves_the_others_as_they_are():
     """A missing TEMP is no reason for interpolation with what is not a number."""
     moments = [(float(t),) for t in range(20)] + [(np.nan,)]
-    assert all(len(of_points) == 1 for of_points in shares_of_points(moments, [SMOOTH_NODES]).values())
+    assert all(len(of_points) == 1 for of_points in weights_of_points(moments, [SMOOTH_NODES]).values())
 
 
 @pytest.mark.parametrize("swing", [0.05, 0.4, 3.0, 40.0])
 def test_a_phase_that_changes_by_much_has_more_values(swing):
     """The factor exp(i a t) at 500 values of t in (−1, 1), from those at the points."""
     moments = [(float(t),) for t in np.linspace(-1.0, 1.0, 500)]
-    shares = shares_of_points(moments, [nodes_for(swing)])
+    shares = weights_of_points(moments, [nodes_for(swing)])
     error = [
         abs(
             sum(part * np.exp(1j * swing * t) for (t,), part in shares[moment].items())

@@ -12,6 +12,7 @@ import pytest
 from astropy.table import Table
 from one_arm import POLARISER, one_arm
 
+import walop_jax as walop
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
@@ -25,7 +26,9 @@ from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import Scalar, number
-from walop_jax.plans.available import plan_beside
+from walop_jax.plans.available import CandidateExposure, plan_beside
+from walop_jax.plans.exposure_plan import PlannedExposure
+from walop_jax.reports.wording import data_in_words
 from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
@@ -37,13 +40,14 @@ VOLTS = (-5.0, 5.0)
 
 
 class VoltageCell(Element):
-    """A retarder whose retardance grows with a voltage; it says nothing of a period."""
+    """A retarder whose retardance grows with a voltage; it has a unit, and says nothing of a period."""
 
     base: Scalar = number("rad", "retardance at 0 V")
     slope: Scalar = number("rad", "change per volt")
     axis: Scalar = number("deg", "fast axis")
     volt: float = eqx.field(static=True, default=0.0)
     kind: ClassVar[str] = "voltage_cell"
+    reading_unit: ClassVar[str] = "V"
 
     def turned(self, angle):
         return dataclasses.replace(self, volt=float(angle))
@@ -86,7 +90,7 @@ def calibration(instrument) -> Calibration:
         filters=("SDSS-r",), moving={"FLC": VOLTS},
     )  # fmt: skip
     calset = simulate(plan, seed=3).calset
-    return Calibration.from_fit(refit(calset, base_model(calset, instrument)).judged())
+    return Calibration.from_fit(refit(calset, base_model(calset, instrument)).with_verdict())
 
 
 def retarder_by_hand(volt: float, base: float = BASE, slope: float = SLOPE, axis: float = AXIS) -> np.ndarray:
@@ -202,3 +206,26 @@ def _window(tmp_path) -> Instrument:
     path = tmp_path / "window.toml"
     path.write_text(one_arm("WINDOW", ["polariser", "modulator"], POLARISER + window))
     return Instrument.read(path)
+
+
+class SilentCell(VoltageCell):
+    """The same, but it says nothing of the unit of its reading."""
+
+    kind: ClassVar[str] = "silent_cell"
+
+    def turned(self, angle):
+        return super().turned(angle)
+
+
+def test_a_reading_is_written_with_its_unit(instrument, calibration):
+    """Degrees of what turns, volts of what says so, and the number alone where nothing is said."""
+    assert nominal_instrument().reading_in_words("CHWP", 22.5) == "22.5°"
+    assert instrument.reading_in_words("FLC", -5.0) == "−5 V"
+    assert SilentCell.reading_in_words(-5.0) == "−5"
+    assert SilentCell.period is None
+    assert "FLC at −5 V" in str(walop.matrix(calibration, x=0.0, y=0.0, at={"FLC": -5.0}))
+    assert dict(data_in_words(calibration))["FLC"] == "−5 V, 5 V"
+    choice = CandidateExposure("clp", "SDSS-r", {"FLC": -5.0}, 30.0, ())
+    assert choice.in_words(instrument.reading_in_words) == "clp, SDSS-r, FLC −5 V, 30 s"
+    line = PlannedExposure("clp", "SDSS-r", {"FLC": -5.0}, 45.0, -1, 1, 30.0, 1.0, 1.0, 30.0, 0.0)
+    assert line.cells(instrument.reading_in_words)[2:4] == ("FLC −5 V", "45.0°")

@@ -158,14 +158,14 @@ def test_beams_of_a_band_by_hand():
     seen = np.zeros((1, 2, 4))
     seen[0, :, 0] = 1.0, 0.5
     rows = analyser.in_band(jnp.asarray(seen), jnp.array([1.3]))[0, :, 0]
-    np.testing.assert_allclose(analyser.shares() @ rows, [0.77, 0.27], rtol=1e-14)
+    np.testing.assert_allclose(analyser.beam_weights() @ rows, [0.77, 0.27], rtol=1e-14)
 
 
 def test_beams_see_neighbouring_wavelengths():
     """First beam ½ (1 + κ λ∂)(S0 + q), second ½ (1 − κ λ∂)(S0 − q)."""
     analyser = Analyser(dispersion=0.01, cameras=("a", "b"))
     expected = [[0.005, 0.005], [-0.005, 0.005]]
-    np.testing.assert_allclose(analyser.shares_of_slopes(), expected, rtol=1e-14)
+    np.testing.assert_allclose(analyser.beam_weights_of_slopes(), expected, rtol=1e-14)
 
 
 def test_a_spread_of_the_retardance_is_the_mean_of_its_retarders():

@@ -22,7 +22,7 @@ from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.sources import Sight, Standards, mean_over_band
+from walop_jax.model.sources import PointIllumination, Standards, mean_over_band
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import simulate, truth_values
 
@@ -103,9 +103,11 @@ def test_a_value_of_each_filter_is_the_one_that_counts():
     exposures = dataclasses.replace(
         plan.exposures, colour=colour, rotator=jnp.zeros_like(plan.exposures.rotator)
     )
-    sight = Sight(exposures, jnp.zeros((len(star), 2)), jnp.array(star), jnp.zeros(()), jnp.zeros(()))
+    illumination = PointIllumination(
+        exposures, jnp.zeros((len(star), 2)), jnp.array(star), jnp.zeros(()), jnp.zeros(())
+    )
     np.testing.assert_allclose(
-        both.polarisation(sight)[star > 0], [[0.03, 0.01]] * (star > 0).sum(), rtol=1e-14
+        both.polarisation(illumination)[star > 0], [[0.03, 0.01]] * (star > 0).sum(), rtol=1e-14
     )
 
 
@@ -135,7 +137,7 @@ def test_the_slope_inside_a_band_is_in_the_counts():
     laid = plan_for(device, e, curves, stars)
     number = int(np.flatnonzero(e.kind == "standard")[1])
     source = np.where(np.arange(len(e)) == number, 1, -1)
-    sight = Sight(laid.exposures, jnp.zeros((len(e), 2)), jnp.array(source), x, y)
+    illumination = PointIllumination(laid.exposures, jnp.zeros((len(e), 2)), jnp.array(source), x, y)
     band = np.take_along_axis(laid.band_of, source[:, None] + 1, 1)[:, 0]
     throughput = device.throughput.at(x, y)
 
@@ -148,12 +150,12 @@ def test_the_slope_inside_a_band_is_in_the_counts():
         )
 
     modelled = np.asarray(
-        light.counts(device, light.band_rows(device, laid, x, y), throughput, sight, jnp.array(band))
+        light.counts(device, light.band_rows(device, laid, x, y), throughput, illumination, jnp.array(band))
     )[number]
     wavelength = np.asarray(laid.wavelength)
     law = np.exp(-(1.66 * lmax + 0.01) * np.log(lmax / wavelength) ** 2)
     flat, sloping = counts(1.0)[band[number]], counts(law)[band[number]]
-    qu = np.asarray(device.standard.polarisation(sight))[number]
+    qu = np.asarray(device.standard.polarisation(illumination))[number]
     exact = flat[:, 0] + sloping[:, 1:3] @ qu
     without = flat[:, 0] + flat[:, 1:3] @ qu
     assert np.abs(without - exact).max() > 1e-5 * exact.max()

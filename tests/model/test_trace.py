@@ -16,7 +16,7 @@ from walop_jax.model.effects import FreeForm, effect_by_name
 from walop_jax.model.effects.base import Context
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.planning import plan_for
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 from walop_jax.model.trace import STOKES, LightStage, Sightline, trace
 
 
@@ -56,9 +56,9 @@ def counts_of(instrument, sightline: Sightline) -> np.ndarray:
     plan = plan_for(instrument, builders.exposures(row), {band.name: band})
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     rows = light.band_rows(instrument, plan, x, y)
-    sight = Sight(plan.exposures, jnp.zeros((1, 2)), jnp.asarray([1]), x, y)
+    illumination = PointIllumination(plan.exposures, jnp.zeros((1, 2)), jnp.asarray([1]), x, y)
     throughput = instrument.throughput.at(x, y)
-    return np.asarray(light.counts(instrument, rows, throughput, sight, jnp.asarray([0]))[0])
+    return np.asarray(light.counts(instrument, rows, throughput, illumination, jnp.asarray([0]))[0])
 
 
 def named(stages: tuple[LightStage, ...], name: str) -> np.ndarray:
@@ -80,7 +80,7 @@ def both_ends_meet(instrument: Instrument, stages: tuple[LightStage, ...]) -> No
         cameras = [instrument.cameras.names.index(name) for name in arm.analyser.cameras]
         seen = arm.analyser.seen(jnp.zeros((4, 4)).at[:, 0].set(beam))[:, 0]
         np.testing.assert_allclose(
-            named(stages, "analysers")[0, cameras], arm.analyser.shares() @ seen, rtol=0, atol=1e-14
+            named(stages, "analysers")[0, cameras], arm.analyser.beam_weights() @ seen, rtol=0, atol=1e-14
         )
 
 

@@ -118,7 +118,7 @@ def test_a_set_with_a_turning_plate_is_fitted(tmp_path):
     calset = simulate(plan, 3).calset
     fit = refit(calset)
     assert abs(fit.excess) < 4.0
-    fit.judged().save(tmp_path / "RUN")
+    fit.with_verdict().save(tmp_path / "RUN")
     turn = walop.read(tmp_path / "RUN").calibration.exposures.positions["CHWP"].turn
     np.testing.assert_array_equal(turn, calset.exposures.positions["CHWP"].turn)
     assert turn.max() == 70.0

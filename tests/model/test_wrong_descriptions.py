@@ -55,7 +55,7 @@ WRONG = {
     "Angstrom for um": ((WINDOW, 'kind = "spectral"\ndelta_at = [4400, 5500]'),
         r"\[elements\.window\] delta_at = 4400 um is not light .* in Angstrom\? write 0\.44"),
     "per cent": (("efficiency = { value = 0.99", "efficiency = { value = 99.8"),
-        r"analyser\] efficiency = 99\.8 must be between 0 and 1 \(a share, not per cent\)"),
+        r"analyser\] efficiency = 99\.8 must be between 0 and 1 \(a fraction, not per cent\)"),
     "no layers": ((WINDOW, 'kind = "wave_plate"'), r"\[elements\.window\] a wave plate needs layers"),
     "sigma of 0": (("sigma = 0.02", "sigma = 0.0"),
         r"\[elements\.window\.delta\] sigma = 0 must be above 0; leave it out"),

@@ -154,7 +154,7 @@ def test_a_break_beside_a_value_for_every_file_is_held_against_other_nights():
 )
 def test_what_a_change_does_to_a_star_is_known_or_not(text, known):
     """Not from the median of a field, the exposure before, or hours since a first one: a star has none of these."""
-    assert Change.parsed(text).of_stars is known
+    assert Change.parsed(text).applies_to_catalogue is known
 
 
 def test_a_model_holds_one_shape_of_an_effect():

@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
         night = simulate(plan, seed=1 + k, instrument=first.truth, catalogue_seed=1).calset
         walop.write_calibration_set(place / f"night{k}.fits", night)
     calset = walop.read(place / "night0.fits")
-    fit(Likelihood.of(calset, base_model(calset))).judged().save(place / "RUN")
+    fit(Likelihood.of(calset, base_model(calset))).with_verdict().save(place / "RUN")
     return place
 
 

@@ -35,7 +35,7 @@ TURN = 0.1  # deg, of the axis of a half-wave plate, between the third night and
 
 
 def fitted(calset):
-    return fit(Likelihood.of(calset, base_model(calset))).judged()
+    return fit(Likelihood.of(calset, base_model(calset))).with_verdict()
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +271,7 @@ def test_bad_input(quiet, single):
     free = next(p.name for p in one.parameters if p.prior is None and p.loose is None)
     with pytest.raises(DataError, match=r"has no information on .*, which has a value of its own there"):
         stack([one, deaf, three], {free: {"per": "night"}})
-    scattered = dataclasses.replace(single, errors_from="residuals").judged()
+    scattered = dataclasses.replace(single, errors_from="residuals").with_verdict()
     with pytest.raises(DataError, match="do not explain its scatter"):
         stack([scattered])
     # The file to leave out is named, not what was typed into it.
@@ -290,7 +290,7 @@ def kept(sets, single, tmp_path_factory):
         walop.write_calibration_set(folder / f"night{k}.fits", calset)
     calset, run = walop.read(folder / "night0.fits"), folder / "RUN"
     law = "[law.'throughput.n1.p00']\nper = 'walk'\nrate = 1e-4\n"
-    fit(Likelihood.of(calset, model_for(calset, law))).judged().save(run)
+    fit(Likelihood.of(calset, model_for(calset, law))).with_verdict().save(run)
     stopped, made = folder / "SURVEY", []
 
     def interrupted(*args, **more):

@@ -59,7 +59,7 @@ def test_effect_of_ones_own_is_simulated_and_fitted():
     model = with_effects(model, [LossyWedge()], effect_context(model.template, calset.exposures))
     result = refit(calset, model)
     i = model.index("lossy_wedge.share")
-    assert result.judged().trusted
+    assert result.with_verdict().trusted
     assert abs(result.values[i] - 0.02) < 5 * result.sigma[i]
     assert result.sigma[i] < 0.002
 
@@ -125,7 +125,7 @@ def test_two_cameras_are_simulated_and_fitted(two_beams):
     calset, truth = simulate(two_beams, seed=1)
     assert calset.cameras == 2
     result = refit(calset, base_model(calset, two_beams.design))
-    assert result.judged().trusted
+    assert result.with_verdict().trusted
     rows = calset.intensities.rows
     free = len(result.model.free)
     priors = sum(p.prior is not None for p in result.model.parameters)
@@ -176,7 +176,7 @@ def test_new_kind_of_exposure():
     model = base_model(calset, instrument)
     result = refit(calset, model)
     i = model.index("twilight.degree")
-    assert result.judged().trusted
+    assert result.with_verdict().trusted
     assert abs(result.values[i] - 0.42) < 5 * result.sigma[i]
 
 

@@ -18,7 +18,7 @@ class Twilight(Source):
     name: ClassVar[str] = "twilight"
     kind: ClassVar[str] = "twilight"
 
-    def polarisation(self, sight):
+    def polarisation(self, illumination):
         """(degree, 0) in every exposure."""
-        nothing = jnp.zeros_like(sight.exposures.clp_angle)
+        nothing = jnp.zeros_like(illumination.exposures.clp_angle)
         return jnp.stack([self.degree + nothing, nothing], axis=-1)

@@ -24,7 +24,7 @@ SPOILT = 2
 
 def calibrate(calset):
     model = base_model(calset)
-    return Calibration.from_fit(refit(calset, model).judged())
+    return Calibration.from_fit(refit(calset, model).with_verdict())
 
 
 @pytest.fixture(scope="module")

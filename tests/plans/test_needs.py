@@ -91,12 +91,12 @@ def test_what_only_the_sky_shows_and_what_it_does_to_stars():
         }
     )
     assert min(errors.values()) > UNMEASURED
-    indoors = ObservingPlan(grid=2, moon_patches=0, standards=0).exposures()
-    (finding,) = lacks(plan.design, EFFECTS, plan.context(), indoors)
+    polariser_alone = ObservingPlan(grid=2, moon_patches=0, standards=0).exposures()
+    (finding,) = lacks(plan.design, EFFECTS, plan.context(), polariser_alone)
     assert finding.what.startswith(
         "rotator_zero.angle, telescope_polarisation.q, telescope_polarisation.u not measured"
     )
-    assert list(lacks(plan.design, EFFECTS, plan.context(), indoors, plan.exposures())) == []
+    assert list(lacks(plan.design, EFFECTS, plan.context(), polariser_alone, plan.exposures())) == []
     one = ObservingPlan(grid=2, polariser_angles=(0.0, 180.0)).exposures()
     assert [finding.severity for finding in lacks(plan.design, EFFECTS, plan.context(), one)] == ["fault"]
 

@@ -26,7 +26,7 @@ from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import refit
 from walop_jax.io.names import PLANNED
 from walop_jax.io.text import json_text
-from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.flux import FluxGroups
 from walop_jax.likelihood.likelihood import prior_rows
 from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument
@@ -149,7 +149,7 @@ def test_what_a_calibration_knows_holds_its_priors_once():
 
 def test_errors_have_the_floor_of_the_instrument():
     """Two cameras, by hand: both errors 1 % of the mean of 6·10⁵ and 4·10⁵, the flux eliminated."""
-    light = Illumination(np.array([1e6]), PhotonNoise(1.0), 0.01, Sharing(None), np.ones(1))
+    light = Illumination(np.array([1e6]), PhotonNoise(1.0), 0.01, FluxGroups(None), np.ones(1))
     information = light.information(np.array([[[0.6, 0.4]]]), np.array([[[[1.0], [-1.0]]]]))
     assert information[0, 0, 0] == pytest.approx(2 * 200.0**2 - 40.0**2 / 0.52, rel=1e-12)
     gain = light.gain(np.array([[[0.6], [0.4]]]), np.array([[[1.0], [-1.0], [1.0]]]))
@@ -159,7 +159,7 @@ def test_errors_have_the_floor_of_the_instrument():
 def test_errors_that_grow_with_the_light_are_those_of_the_cameras():
     """By hand: counts 6·10⁵ and 4·10⁵; errors 2 √N beside 0.1 % of the counts in the second camera alone."""
     errors = np.array([4.0, 4.0]), np.array([0.0, 1e-6])
-    light = Illumination(np.array([1e6]), PhotonNoise(1e-9), 0.0, Sharing(None), np.ones(1), errors=errors)
+    light = Illumination(np.array([1e6]), PhotonNoise(1e-9), 0.0, FluxGroups(None), np.ones(1), errors=errors)
     information = light.information(np.array([[[0.6, 0.4]]]), np.array([[[[1.0], [-1.0]]]]))
     first, second = 1e12 / (4.0 * 6e5), 1e12 / (4.0 * 4e5 + 1e-6 * 1.6e11)
     flux = (0.6 * first - 0.4 * second) ** 2 / (0.36 * first + 0.16 * second)
@@ -234,8 +234,8 @@ def test_the_plan_of_a_night_contains_what_a_go_needs(planned):
 
 def test_a_plan_without_the_sky_is_no_go_and_its_first_line_says_so(small, field):
     """0.20 % of telescope polarisation, as `check` would say it of a fit."""
-    indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
-    plan = plan_from(indoors, 15.0, criterion_by_name(small, field, "worst"), field)
+    polariser_alone = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
+    plan = plan_from(polariser_alone, 15.0, criterion_by_name(small, field, "worst"), field)
     first = repr(plan).splitlines()[0]
     assert first.startswith("No go with this plan alone: ")
     assert "telescope_polarisation.q, telescope_polarisation.u not measured" in first
@@ -362,9 +362,9 @@ def test_exposures_that_are_not_there(changes, message):
 
 def test_exposures_that_say_nothing_of_what_is_wanted(small):
     """The polariser is indoors: its light has nothing of the sky."""
-    indoors = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
+    polariser_alone = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
     with pytest.raises(ValueError, match=r"sky.depolarisation: no possible exposure .* no moon or standard"):
-        plan_from(indoors, 15.0, criterion_by_name(indoors, None, "sky.depolarisation"))
+        plan_from(polariser_alone, 15.0, criterion_by_name(polariser_alone, None, "sky.depolarisation"))
 
 
 def test_a_time_that_pays_for_nothing(small, field):
@@ -563,7 +563,9 @@ def test_stars_of_a_field_tell_no_more_of_their_mean_than_their_scatter_allows()
     slopes = np.zeros((6, 1, 4, 3))
     slopes[..., 0], slopes[..., 1] = [0.25, -0.25, 0.0, 0.0], [0.0, 0.0, 0.25, -0.25]
     slopes[..., 2] = rng.normal(size=(6, 1, 4)) * 0.1
-    light = Illumination(np.full(6, 4e10), PhotonNoise(30.0), 0.0, Sharing(), np.ones(6), {0: size, 1: size})
+    light = Illumination(
+        np.full(6, 4e10), PhotonNoise(30.0), 0.0, FluxGroups(), np.ones(6), {0: size, 1: size}
+    )
     found = light.information(unit, slopes)[0]
     np.testing.assert_allclose(np.diag(found)[:2], 6.0 / size**2, rtol=1e-3)
     alone = light._replace(scatter={}).information(unit, slopes)[0]

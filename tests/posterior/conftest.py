@@ -29,7 +29,7 @@ def worlds() -> Worlds:
 @pytest.fixture(scope="session")
 def scene(worlds: Worlds) -> Scene:
     world = worlds.draw(np.random.default_rng(11))
-    result = fit(world.likelihood, start=world.truth).judged()
+    result = fit(world.likelihood, start=world.truth).with_verdict()
     assert result.converged
     target = Target(result)
     return Scene(world, result, target, build_surrogate(target))

@@ -123,14 +123,14 @@ class Study:
 
     def emcee(self, seed: int) -> Outcome:
         world = self.worlds.draw(np.random.default_rng([seed, 1]))
-        result = fit(world.likelihood).judged()
+        result = fit(world.likelihood).with_verdict()
         posterior = sample(result, Options(seed=seed, checks=64))
         draws = posterior.draws.reshape(-1, len(posterior.names))
         return self.outcome(world, result, draws, seed, posterior.trusted)
 
     def laplace(self, seed: int) -> Outcome:
         world = self.worlds.draw(np.random.default_rng([seed, 1]))
-        result = fit(world.likelihood).judged()
+        result = fit(world.likelihood).with_verdict()
         rng = np.random.default_rng([seed, 2])
         free, model = world.likelihood.model.free, world.likelihood.model
         root = np.linalg.cholesky(result.covariance[np.ix_(free, free)] / np.outer(*2 * [result.sigma[free]]))

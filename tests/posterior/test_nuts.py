@@ -32,7 +32,7 @@ def test_emcee_agrees_with_nuts(either_south_set: Callable[[str], SouthSet]) -> 
     """Means to 0.1 σ, widths to 5 % beyond twice the sampling error of NUTS (ours is far smaller)."""
     pytest.importorskip("blackjax")
     calset = read_calibration_set(either_south_set("a").path)
-    result = fit(Likelihood.of(calset, base_model(calset))).judged()
+    result = fit(Likelihood.of(calset, base_model(calset))).with_verdict()
     ours = sample(result, Options(seed=1, interval=2000))
     assert ours.trusted, ours.warnings
     nuts = sample(result, Options(sampler="nuts", interval=DRAWS // 2, maximum_steps=DRAWS, draws=DRAWS))

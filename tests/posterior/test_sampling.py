@@ -44,7 +44,7 @@ def with_scale(scene: Scene) -> FitResult:
     """The fit of the scene with a scale of all errors."""
     model = with_noise(scene.result.model, scale="all")
     start = np.append(scene.result.values, 1.0)
-    return fit(Likelihood.of(scene.result.calset, model), start=start).judged()
+    return fit(Likelihood.of(scene.result.calset, model), start=start).with_verdict()
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_errors_that_differ_between_cameras_need_the_exact_posterior(scene: Scen
     calset = scene.result.calset
     model = with_noise(scene.result.model, fraction="camera")
     start = np.append(scene.result.values, model.start[len(scene.result.values) :])
-    result = fit(Likelihood.of(calset, model), start=start).judged()
+    result = fit(Likelihood.of(calset, model), start=start).with_verdict()
     with pytest.raises(DataError, match=r"noise\.fraction_O1.*--sampler nuts"):
         sample(result, OPTIONS)
 

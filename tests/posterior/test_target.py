@@ -57,7 +57,7 @@ def test_parameters_of_the_errors_are_coordinates_of_it(scene: Scene) -> None:
     """−2 ln p with a scale s: χ²/s² + 2 (n − n_F) ln s, by hand, at the fit of all other parameters."""
     model = with_noise(scene.result.model, scale="all")
     start = np.append(scene.result.values, 1.0)
-    result = fit(Likelihood.of(scene.result.calset, model), start=start).judged()
+    result = fit(Likelihood.of(scene.result.calset, model), start=start).with_verdict()
     target = Target(result)
     density = ExactPosterior(target, choose_sampled(target)).density()
     assert density.dimension == len(scene.target.free) + 1

@@ -47,7 +47,7 @@ WITHOUT = ("corner", "trace", "residual-map", "protection", "separation", *OF_A_
 def source(tmp_path_factory) -> FigureSource:
     folder = tmp_path_factory.mktemp("run")
     write_calibration_set(folder / "set.fits", simulate(SMALL, seed=SEED).calset)
-    calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).judged())
+    calibration = Calibration.from_fit(refit(read_calibration_set(folder / "set.fits")).with_verdict())
     write_calibration(folder / "calibration.fits", calibration)
     return FigureSource(Run(folder))
 
@@ -271,7 +271,7 @@ def test_plates_are_found_by_their_class(tmp_path):
         moving={"WIN": (0.0, 45.0)},
     )
     calset = simulate(plan, seed=SEED).calset
-    calibration = Calibration.from_fit(refit(calset, base_model(calset, design)).judged())
+    calibration = Calibration.from_fit(refit(calset, base_model(calset, design)).with_verdict())
     write_calibration(tmp_path / "calibration.fits", calibration)
     listed = possible(FigureSource(Run(tmp_path)))
     assert listed["retardance"] == "maps of the retardance of main.plate"

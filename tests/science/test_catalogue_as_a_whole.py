@@ -11,7 +11,7 @@ from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.user_tables import in_memory
-from walop_jax.fit.verdict import Hidden, Mistake, Quality, Structure
+from walop_jax.fit.verdict import Hidden, Quality, Structure, UndetectedError
 from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.catalogue_doubts import units_of_counts
@@ -163,7 +163,7 @@ def test_structure_and_hidden_mistakes_of_the_calibration_reach_the_stars(vector
     change = np.zeros((2, len(calibration.values)))
     index = calibration.model.index("half2.efficiency")
     change[1, index] = 1e-3
-    hidden = Hidden(tuple(Mistake(name, 1.0, "") for name in ("nothing", "efficiency")), change)
+    hidden = Hidden(tuple(UndetectedError(name, 1.0, "") for name in ("nothing", "efficiency")), change)
     known = dataclasses.replace(calibration, verdict=verdict, hidden=hidden)
     found = apply(known, read(table, tmp_path))
     assert found.check.holds

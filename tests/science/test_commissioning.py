@@ -29,7 +29,7 @@ def certificate(result, accuracy):
     found = Certificate(
         Path("calibration.fits"), (), asked, Validity((0.0, 0.0), (), (0.0, 0.0)), "", (), verdict
     )
-    assert found.go == verdict.go == Verdict(against=found.against).go
+    assert found.go == verdict.go == Verdict(doubts=found.against).go
     return found
 
 
@@ -82,8 +82,8 @@ def test_an_error_that_is_not_known_is_no_go(change):
 
 
 def test_what_is_not_trusted_is_no_go():
-    bad = small_fit().judged(["the residuals hold patterns"])
-    assert certificate(small_fit().remarked("a remark"), accuracy()).go
+    bad = small_fit().with_verdict(["the residuals hold patterns"])
+    assert certificate(small_fit().with_remark("a remark"), accuracy()).go
     refused = certificate(bad, accuracy())
     assert not refused.go
     # The first reason alone, and nothing of an accuracy that is not known.

@@ -20,9 +20,9 @@ from walop_jax.calibration.product import read_calibration, write_calibration
 from walop_jax.data.records import ERROR_WORDS
 from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hidden_mistakes import _Starlight, hidden_mistakes
 from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.diagnosis.trust import examined
+from walop_jax.diagnosis.undetected_errors import _Starlight, undetected_errors
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
 from walop_jax.science.apply import apply
@@ -87,8 +87,8 @@ def only(calibration: Calibration, name: str) -> Calibration:
     """The calibration with one of its mistakes."""
     hidden = calibration.hidden
     assert hidden is not None
-    at = [mistake.name for mistake in hidden.mistakes].index(name)
-    return dataclasses.replace(calibration, hidden=Hidden((hidden.mistakes[at],), hidden.changes[[at]]))
+    at = [mistake.name for mistake in hidden.errors].index(name)
+    return dataclasses.replace(calibration, hidden=Hidden((hidden.errors[at],), hidden.changes[[at]]))
 
 
 def star(tmp_path, calibration: Calibration, q: float, plate=None, rotator=None) -> tuple[float, float]:
@@ -128,8 +128,8 @@ def test_a_plate_that_was_never_in_the_beam_is_unknown_where_stars_are_seen_thro
 
 def test_what_moon_and_standards_measure_is_measured():
     design = Design.of(small_fit())
-    hidden = hidden_mistakes(design, Singles.of(design))
-    assert all(mistake.measured for mistake in hidden.mistakes)
+    hidden = undetected_errors(design, Singles.of(design))
+    assert all(mistake.measured for mistake in hidden.errors)
     found = could_hide(dataclasses.replace(Calibration.from_fit(small_fit()), hidden=hidden))
     assert [one.error[0] for one in found] == sorted((one.error[0] for one in found), reverse=True)
 
@@ -162,7 +162,7 @@ FINE = {"position": 15.0, "scale": 0.01, "scattered": 1e-3, "teff": 0.5}
 def test_what_hides_is_what_the_data_do_not_show_and_is_plausible(errors):
     """h = min(w, √λ s): w the error that the set states, s the error with which its data measure the number."""
     design, singles = singles_of(**errors)
-    mistakes = {one.name: one for one in hidden_mistakes(design, singles).mistakes}
+    mistakes = {one.name: one for one in undetected_errors(design, singles).mistakes}
     found, least = list[str](), np.sqrt(found_with_99_per_cent(len(singles.testable)))
     for item in singles.items:
         name = item.single.candidate.name
@@ -181,7 +181,7 @@ def test_positions_of_an_arcsecond_hide_no_more_than_that():
     product = Calibration.from_fit(small_fit())
 
     def by_positions(**errors: float) -> float:
-        hidden = hidden_mistakes(*singles_of(**errors))
+        hidden = undetected_errors(*singles_of(**errors))
         found = could_hide(dataclasses.replace(product, hidden=hidden))
         places = ("X of all", "Y of all", "the scale of", "the angle of the field")
         return max((one.error[0] for one in found if one.name.startswith(places)), default=0.0)
@@ -194,8 +194,8 @@ def test_positions_of_an_arcsecond_hide_no_more_than_that():
 
 def test_a_number_that_is_known_exactly_hides_nothing():
     exactly = dict.fromkeys(ERROR_WORDS, 0.0)
-    hidden = hidden_mistakes(*singles_of(**exactly))
-    of_data = [one.name for one in hidden.mistakes if one.kind == "data"]
+    hidden = undetected_errors(*singles_of(**exactly))
+    of_data = [one.name for one in hidden.errors if one.kind == "data"]
     # Who takes coordinates of date for ICRS is wrong by the years since 2000, however well they are measured.
     assert set(of_data) <= {"the equinox of RA and DEC"}
 

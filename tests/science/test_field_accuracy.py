@@ -9,7 +9,7 @@ from small_run import small_fit
 
 from walop_jax.calibration.accuracy import p_errors, sample_stars
 from walop_jax.calibration.calibration import Calibration
-from walop_jax.fit.verdict import Hidden, Mistake
+from walop_jax.fit.verdict import Hidden, UndetectedError
 from walop_jax.science.field_accuracy import GROUPS, FieldAccuracy, field_accuracy
 
 IDEAL = np.array([[0.0, 1.0, 0.0, 0.0, 0.0, 1.0]])
@@ -88,7 +88,7 @@ def test_what_limits_it_is_what_alone_is_uncertain():
         assert found.limited_by == f"{GROUPS[part]} (100 % of the variance)"
     change = np.where(np.array(calibration.model.names) == "collimator.q", 0.002, 0.0)
     check = "an independent check of the field positions"
-    hidden = Hidden((Mistake("the scale of X and Y", 0.02, "", remedy=check),), change[None])
+    hidden = Hidden((UndetectedError("the scale of X and Y", 0.02, "", remedy=check),), change[None])
     found = field_accuracy(dataclasses.replace(calibration, hidden=hidden), size=3)
     assert found is not None
     # A diattenuation of the light ahead of everything is an offset of q: 0.002, but for what p does to second order.

@@ -22,7 +22,7 @@ from walop_jax.commands.program import app
 from walop_jax.data.write import write_calibration_set
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.model_of_set import model_for
-from walop_jax.fit.refit import fit, refit, with_honest_errors
+from walop_jax.fit.refit import fit, refit, with_empirical_covariance
 from walop_jax.fit.verdict import Doubt, Quality, Structure
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import effect_by_name
@@ -32,7 +32,7 @@ from walop_jax.simulation.simulate import simulate
 
 
 def calibrate(calset):
-    return Calibration.from_fit(refit(calset).judged())
+    return Calibration.from_fit(refit(calset).with_verdict())
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_what_is_wrong_is_named(product, tmp_path):
         return changed(verdict=dataclasses.replace(product.verdict, **more))
 
     assert failed(verdict(converged=False)) == ["converged"]
-    assert failed(verdict(against=(Doubt(Quality.UNEXPLAINED, ""),))) == ["explains the data"]
-    assert failed(verdict(against=(Doubt(Quality.ILL_CONDITIONED, "", blocking=False),))) == ["conditioned"]
+    assert failed(verdict(doubts=(Doubt(Quality.UNEXPLAINED, ""),))) == ["explains the data"]
+    assert failed(verdict(doubts=(Doubt(Quality.ILL_CONDITIONED, "", blocking=False),))) == ["conditioned"]
     broken = product.covariance.copy()
     broken[0, 1] += 3 * np.sqrt(broken[0, 0] * broken[1, 1]) + 1e-6
     assert "covariance" in failed(changed(covariance=broken))
@@ -117,7 +117,7 @@ def test_a_calibration_is_checked_from_the_command_line(product, tmp_path):
     assert told["commissioning"]["content"] == product.content_hash()
     assert told["commissioning"]["parents"] == [product.inputs[0].sha256]
     bad = dataclasses.replace(
-        product, verdict=dataclasses.replace(product.verdict, against=(Doubt(Quality.DOUBTED, "odd"),))
+        product, verdict=dataclasses.replace(product.verdict, doubts=(Doubt(Quality.DOUBTED, "odd"),))
     )
     write_calibration(tmp_path / "bad.fits", bad)
     result = CliRunner().invoke(app, ["check", str(tmp_path / "bad.fits")])
@@ -141,7 +141,7 @@ def test_an_instrument_that_has_not_changed_still_fits(first):
     """Over six later runs of the same instrument T follows its χ², and no run is called a change."""
     truth, old = first
     found = [
-        epoch(old, fit_like(old, simulate(SMALL, seed=100 + k, instrument=truth).calset).judged())
+        epoch(old, fit_like(old, simulate(SMALL, seed=100 + k, instrument=truth).calset).with_verdict())
         for k in range(6)
     ]
     assert all(entry.fits for entry in found)
@@ -162,7 +162,7 @@ def test_a_change_is_found_and_named(first):
     """A wedge that has yielded by half a milliradian."""
     truth, old = first
     bent = truth.changed("half2.wedge", angle=lambda angle: angle + 5e-4)
-    found = epoch(old, fit_like(old, simulate(SMALL, seed=200, instrument=bent).calset).judged())
+    found = epoch(old, fit_like(old, simulate(SMALL, seed=200, instrument=bent).calset).with_verdict())
     assert not found.fits
     assert found.moved[0].name == "half2.wedge"
     assert found.moved[0].new - found.moved[0].old == pytest.approx(5e-4, abs=4 * found.moved[0].error)
@@ -175,7 +175,7 @@ def test_a_camera_that_has_become_fainter_is_found_with_its_size(first):
     throughput = truth.throughput
     fainter = throughput.coefficients.at[1, 0].add(-0.01)
     dim = dataclasses.replace(truth, throughput=dataclasses.replace(throughput, coefficients=fainter))
-    found = epoch(old, fit_like(old, simulate(SMALL, seed=210, instrument=dim).calset).judged())
+    found = epoch(old, fit_like(old, simulate(SMALL, seed=210, instrument=dim).calset).with_verdict())
     assert found.fits is False
     moved = {entry.name: entry for entry in found.moved}["throughput.n1.p00"]
     assert moved.new - moved.old == pytest.approx(-0.01, abs=4 * moved.error)
@@ -186,7 +186,7 @@ def test_a_plate_that_has_turned_is_a_change_and_not_errors_that_became_large(fi
     truth, old = first
     turned = effect_by_name("hwp1_axis").of(SMALL.context(), angle=0.05)
     calset = simulate(SMALL, seed=220, instrument=truth, effects=[turned]).calset
-    unlike = fit_like(old, calset).judged()
+    unlike = fit_like(old, calset).with_verdict()
     assert not unlike.trusted
     found = epoch(old, unlike)
     assert found.fits is None
@@ -200,7 +200,7 @@ def test_a_plate_that_has_turned_is_a_change_and_not_errors_that_became_large(fi
     assert len(found.to_table()) == 0
 
     larger = with_effects(unlike.model, [turned], SMALL.context())
-    found = epoch(old, with_honest_errors(fit(Likelihood.of(calset, larger))).judged())
+    found = epoch(old, with_empirical_covariance(fit(Likelihood.of(calset, larger))).with_verdict())
     assert found.fits is False
     assert found.added == ("hwp1_axis",)
     assert found.largest.name == "hwp1_axis.angle"
@@ -215,7 +215,7 @@ def test_a_plate_that_has_turned_is_a_change_and_not_errors_that_became_large(fi
 def test_one_number_that_has_changed_by_five_standard_errors_is_not_hidden_by_all_others(first):
     """The parameter that hangs together least with others: of some seventy directions the sum does not see it."""
     truth, old = first
-    result = fit_like(old, simulate(SMALL, seed=5, instrument=truth).calset).judged()
+    result = fit_like(old, simulate(SMALL, seed=5, instrument=truth).calset).with_verdict()
     same = Calibration.from_fit(result)
     quiet = epoch(same, result)
     assert quiet.fits
@@ -255,7 +255,7 @@ def test_errors_of_a_catalogue_that_both_fits_take_are_no_change():
     stars = dataclasses.replace(calset.sources, q_err=width, u_err=width)
     calset = dataclasses.replace(calset, intensities=dim, sources=stars, inputs=())
     model = with_effects(base_model(calset), [effect.neutral(SMALL.context())], SMALL.context())
-    result = refit(calset, model).judged()
+    result = refit(calset, model).with_verdict()
     found = epoch(Calibration.from_fit(result), result)
     c = result.covariance[np.ix_(model.free, model.free)]
     prior = np.array([(model.parameters[i].prior or (0.0, np.inf))[1] ** -2.0 for i in model.free])

@@ -18,7 +18,7 @@ import numpy as np
 from study_options import options_of
 
 import walop_jax as walop
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 from walop_jax.simulation.observing_plan import polariser_turn
 
 PLAN = walop.ObservingPlan(
@@ -35,10 +35,10 @@ def of_stars(likelihood, instrument) -> np.ndarray:
     source[number] = likelihood.calset.intensities.block(0, len(likelihood.calset.points)).source.max(axis=0)[
         number
     ]
-    sight = Sight(
+    illumination = PointIllumination(
         likelihood.plan.exposures, jnp.zeros((len(e), 2)), jnp.array(source), jnp.zeros(()), jnp.zeros(())
     )
-    return instrument.standard.polarisation(sight)[number]
+    return instrument.standard.polarisation(illumination)[number]
 
 
 def pulls(fit, truth) -> np.ndarray:

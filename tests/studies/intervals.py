@@ -42,7 +42,7 @@ from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
 from walop_jax.diagnosis.trust import examined  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
-from walop_jax.fit.refit import FitResult, fit, refit, with_honest_errors  # noqa: E402
+from walop_jax.fit.refit import FitResult, fit, refit, with_empirical_covariance  # noqa: E402
 from walop_jax.fit.verdict import Quality  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
 from walop_jax.model.effects import effect_by_name  # noqa: E402
@@ -151,7 +151,7 @@ def frames(runs: int) -> Iterator[tuple[FitResult, tuple[np.ndarray, np.ndarray]
             write_frames(path, with_block(made.calset, counts=counts), grid, dtype="f8")
             calset = read_calibration_set(path)
             model = base_model(calset, throughput_degree=2)
-            found = examined(with_honest_errors(fit(Likelihood.of(calset, model))), as_written=True)
+            found = examined(with_empirical_covariance(fit(Likelihood.of(calset, model))), as_written=True)
             rng = np.random.default_rng(seed)
             yield found, pulls(Calibration.from_fit(found), made.truth, made.calset, rng, gains=wave)
 

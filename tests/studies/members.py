@@ -24,7 +24,7 @@ from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit, with_honest_errors
+from walop_jax.fit.refit import fit, with_empirical_covariance
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.in_models import effect_context, with_effects
@@ -44,12 +44,12 @@ def judged(seed: int) -> sealed.Judged:
     base = base_model(one.calset)
     context = effect_context(base.template, one.calset.exposures)
     model = with_effects(base, [Described.saying([TOLD], [size])], context)
-    result = with_honest_errors(fit(Likelihood.of(one.calset, model))).judged()
+    result = with_empirical_covariance(fit(Likelihood.of(one.calset, model))).with_verdict()
     every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
     state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
     classes = ambiguities(state, {TOLD: ()})
-    return sealed.judged(averaged(Calibration.from_fit(result), classes), True, one)
+    return sealed.with_verdict(averaged(Calibration.from_fit(result), classes), True, one)
 
 
 def main() -> None:

@@ -347,7 +347,7 @@ def smallest(count: int, start: int = 0, nights: int = 200) -> None:
 def like() -> Calibration:
     """A calibration of the instrument of the series."""
     calset = first_night().calset
-    return Calibration.from_fit(fit(Likelihood.of(calset, base_model(calset))).judged())
+    return Calibration.from_fit(fit(Likelihood.of(calset, base_model(calset))).with_verdict())
 
 
 def stars(count: int, start: int = 0, nights: int = 243) -> None:

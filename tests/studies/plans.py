@@ -41,7 +41,7 @@ from walop_jax.diagnosis.exact import try_effect  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.likelihood.likelihood import Likelihood  # noqa: E402
-from walop_jax.model.cameras import with_floor  # noqa: E402
+from walop_jax.model.cameras import with_noise_floor  # noqa: E402
 from walop_jax.model.effects.in_models import effect_context  # noqa: E402
 from walop_jax.plans.available import Available  # noqa: E402
 from walop_jax.plans.criteria import NAMED, criterion_by_name, field_errors  # noqa: E402
@@ -104,7 +104,7 @@ def linear_fit(
     """By how much the first step of a fit from the truth is wrong; by how many σ a full fit differs from it."""
     instrument = found.model.instrument(found.values[draw])
     simulated = simulate(plan, seed=seed, instrument=instrument, steady=True)
-    calset = scattered(simulated.calset, instrument.cameras.floor, seed)
+    calset = scattered(simulated.calset, instrument.cameras.noise_floor, seed)
     model = base_model(calset, plan.design, throughput_degree=plan.throughput_degree)
     truth = truth_values(simulated.truth)
     values = np.array([truth[name] for name in model.names])
@@ -125,7 +125,7 @@ def scattered(calset: CalibrationSet, floor: float, seed: int) -> CalibrationSet
     if floor == 0.0:
         return calset
     block = block_of(calset)
-    more = np.sqrt(with_floor(block.sigma, block.counts, floor) ** 2 - block.sigma**2)
+    more = np.sqrt(with_noise_floor(block.sigma, block.counts, floor) ** 2 - block.sigma**2)
     counts = block.counts + more * np.random.default_rng([seed, 1]).normal(size=block.counts.shape)
     return with_block(calset, counts=counts)
 

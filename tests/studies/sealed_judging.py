@@ -134,7 +134,7 @@ def home_of(sentence: str, instrument: Instrument) -> str:
     if change.place == "band":
         return "band"
     if polariser is not None and change.place == polariser.name:
-        return {"ahead of": "ahead of polariser", "of": "polariser"}.get(change.where, "common train")
+        return {"ahead of": "ahead of polariser", "of": "polariser"}.get(change.relation, "common train")
     return "common train"
 
 

@@ -76,26 +76,26 @@ class Judged(NamedTuple):
         return f"trusted, wrong, {'seen' if self.gain >= HELD else 'not seen'} by the data"
 
 
-class Mistake(NamedTuple):
+class UndetectedError(NamedTuple):
     """A set changed, and what the gains of the cameras at its field points became: (point, camera), 1 for most."""
 
     calset: CalibrationSet
     gains: np.ndarray
 
 
-def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], Mistake]]:
+def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], UndetectedError]]:
     """One mistake of each kind; those with a size have it drawn: 1 is about what the data just show."""
     size = 10.0 ** rng.uniform(-1.5, 1.0)
 
-    def plain(change: Change) -> Callable[[CalibrationSet], Mistake]:
-        return lambda calset: Mistake(change(calset), np.ones((len(calset.points), calset.cameras)))
+    def plain(change: Change) -> Callable[[CalibrationSet], UndetectedError]:
+        return lambda calset: UndetectedError(change(calset), np.ones((len(calset.points), calset.cameras)))
 
     def counted(
         change: Callable[[CalibrationSet, np.ndarray], np.ndarray],
-    ) -> Callable[[CalibrationSet], Mistake]:
+    ) -> Callable[[CalibrationSet], UndetectedError]:
         return plain(lambda c: with_block(c, counts=change(c, block_of(c).counts.copy())))
 
-    def columns(**changed: Callable[[CalibrationSet], Any]) -> Callable[[CalibrationSet], Mistake]:
+    def columns(**changed: Callable[[CalibrationSet], Any]) -> Callable[[CalibrationSet], UndetectedError]:
         def change(c: CalibrationSet) -> CalibrationSet:
             e = dataclasses.replace(c.exposures, **{name: new(c) for name, new in changed.items()})
             return dataclasses.replace(c, exposures=e)
@@ -106,7 +106,7 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         points = dataclasses.replace(calset.points, x=calset.points.x + 0.003 * size)
         return with_block(dataclasses.replace(calset, points=points), x=points.x)
 
-    def camera(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[CalibrationSet], Mistake]:
+    def camera(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[CalibrationSet], UndetectedError]:
         def changed(_: CalibrationSet, counts: np.ndarray) -> np.ndarray:
             k = rng.integers(counts.shape[-1])
             counts[..., k] = change(counts[..., k])
@@ -137,14 +137,14 @@ def mistakes(rng: np.random.Generator) -> dict[str, Callable[[CalibrationSet], M
         counts[:, calset.exposures.kind == "standard"] += 2000.0 * size
         return counts
 
-    def rough(share: float) -> Callable[[CalibrationSet], Mistake]:
-        def change(calset: CalibrationSet) -> Mistake:
+    def rough(share: float) -> Callable[[CalibrationSet], UndetectedError]:
+        def change(calset: CalibrationSet) -> UndetectedError:
             there = block_of(calset).counts
             shape = (there.shape[0], there.shape[2])
             gains = 1.0 + 5e-4 * size / np.sqrt(share) * rng.standard_normal(shape) * (
                 rng.random(shape) < share
             )
-            return Mistake(with_block(calset, counts=there * gains[:, None]), gains)
+            return UndetectedError(with_block(calset, counts=there * gains[:, None]), gains)
 
         return change
 

@@ -17,7 +17,7 @@ GOAL = 0.001
 """Error of p that instruments are built for."""
 SMALLEST_DETERMINANT = 0.1
 """|m22 m33 − m23 m32| below which a single exposure carries almost no information on u."""
-SHARE = 0.95  # of the field where one exposure measures u: the part that a calibration is judged by
+SHARE = 0.95  # of the field where one exposure measures u: the verdict is about that part
 SIZE = 21  # points along each axis of a map of the field
 NODES = (10, 14, 20, 28)
 _ROUNDING = 1e-12  # of q and u: what the rounding of matrices may make of nothing
@@ -45,7 +45,10 @@ def p_errors(
 def p_forms(
     matrix: Float[np.ndarray, "p 6"], stars: Float[np.ndarray, "*b n 2"]
 ) -> Float[np.ndarray, "p n 6"]:
-    """δp = −e · M⁻¹ · (δm s) of every star as a linear form of the six elements; the same stars (q, u), or of each."""
+    """δp = −e · M⁻¹ · (δm s) of every star as a linear form (p, n, 6) of the six matrix elements.
+
+    `stars` (q, u) are the same at all points (n, 2), or others at each (p, n, 2).
+    """
     stars = np.broadcast_to(stars, (len(matrix), *stars.shape[-2:]))
     with np.errstate(divide="ignore", invalid="ignore"):
         (a, b), (c, d) = matrix[:, 1:3].T, matrix[:, 4:].T
@@ -57,25 +60,28 @@ def p_forms(
 
 
 def measures_u(matrix: Float[np.ndarray, "p 2 3"]) -> Bool[np.ndarray, " p"]:
-    """Places where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
+    """True (p) where one exposure measures q and u, by the determinant of the 2 × 2 part of its matrix."""
     return np.abs(np.linalg.det(matrix[:, :, 1:])) >= SMALLEST_DETERMINANT
 
 
 def reached(error: Float[np.ndarray, "*p"]) -> float:
-    """The error that `SHARE` of some places stay below; NaN without a place."""
+    """The error that the fraction `SHARE` of some field points stay below; NaN without a point."""
     return float(np.quantile(error, SHARE)) if error.size else np.nan
 
 
-def judged(without_u: float) -> str:
-    """The part of the field that `reached` is about, in words; `without_u` is the share that is left out."""
+def field_measured(without_u: float) -> str:
+    """The part of the field that `reached` is about, in words: "95 % of the field" where every exposure measures u.
+
+    `without_u` is the fraction of the field, 0 to 1, in which one exposure does not measure u; it is left out.
+    """
     field = f"{100 * SHARE:.0f} % of the field"
     return f"{field} with u in one exposure ({100 * (1.0 - without_u):.0f} %)" if without_u > 0 else field
 
 
 def change_of_qu(assumed: Matrices, true: Matrices) -> Float[np.ndarray, " p"]:
-    """Largest error of q and u at each field point for stars with p ≤ `LARGEST_P`; NaN where not measured.
+    """Largest error (p) of q and u of stars with p ≤ `LARGEST_P` at each field point; NaN where they are not measured.
 
-    What is no more than the rounding of the matrices is 0.
+    Errors no larger than the rounding of the matrices are 0.
     """
     errors = np.full(len(assumed), np.nan)
     if assumed.shape[1] != 2:  # one exposure of one arm, or of three, does not give q and u and nothing else
@@ -89,6 +95,6 @@ def change_of_qu(assumed: Matrices, true: Matrices) -> Float[np.ndarray, " p"]:
 
 
 def largest_change(assumed: Matrices, true: Matrices) -> float:
-    """Largest of `change_of_qu` over the field; NaN when no point holds both q and u."""
+    """The largest `change_of_qu` over the field; NaN if no point measures both q and u."""
     errors = change_of_qu(assumed, true)
     return float(np.nanmax(errors)) if np.isfinite(errors).any() else float("nan")

@@ -25,7 +25,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import acting_effects, acts_in, turn_of, with_effect
 from walop_jax.calibration.matrix import sky_vectors, vector_slopes
 from walop_jax.data.settings import Settings
-from walop_jax.likelihood.field_table import Vector, accurate_table, details_of, held_out
+from walop_jax.io.shapes import OfPoints
+from walop_jax.likelihood.field_table import accurate_table, details_of, held_out
 from walop_jax.likelihood.inverses import square_root
 from walop_jax.likelihood.optics import plain_positions, through_series
 from walop_jax.model import chebyshev
@@ -37,9 +38,9 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import series_indices
 
-Vectors = Float[np.ndarray, "p k 3"]  # point, camera, Stokes
-Values = Float[np.ndarray, "p f"]  # of a table
-OverField = Callable[[Vector, Vector], Values]
+LinearVectors = Float[np.ndarray, "p k 3"]  # point, camera, Stokes
+TableValues = Float[np.ndarray, "p f"]  # of a table
+OverField = Callable[[OfPoints, OfPoints], TableValues]
 """Values at field positions (deg): a table, or an exact function."""
 
 COLOURS = 12  # colour temperatures of the vectors
@@ -59,7 +60,7 @@ def colour_nodes(count: int) -> Float[np.ndarray, " c"]:
     return COOLEST / (0.5 * (1.0 + chebyshev.nodes(count)))
 
 
-def colour_weights(teff: Vector, count: int) -> Float[np.ndarray, "p c"]:
+def colour_weights(teff: OfPoints, count: int) -> Float[np.ndarray, "p c"]:
     """Weights of the functions (flat spectrum, then `colour_nodes`) for sources of temperature `teff` (K).
 
     NaN is a flat photon spectrum; sources cooler than `COOLEST` are taken as that.
@@ -71,7 +72,9 @@ def colour_weights(teff: Vector, count: int) -> Float[np.ndarray, "p c"]:
 
 
 class Local(NamedTuple):
-    """Derivatives of the vectors at a field point: to the plain parameters, to the throughputs of the cameras."""
+    """Derivatives of the vectors at a field point: in the plain parameters, and in the throughputs of the cameras
+    there.
+    """
 
     plain: Float[np.ndarray, "p k 3 o"]
     throughput: Float[np.ndarray, "p k 3 k"]
@@ -80,8 +83,11 @@ class Local(NamedTuple):
 class AnalysisVectors:
     """The analysis vectors of a calibration, ready to be asked for at many field points.
 
-    `parameters` are the positions, in the calibration's list, of the parameters that the vectors depend on;
-    `root` is a square root of their covariance, C = root rootᵀ. Positions reach to ±`half_width` (deg).
+    `parameters` are the positions, in the calibration's list, of the parameters that the vectors depend on; `root` is a
+    square root of their covariance, C = root rootᵀ. Field positions reach to ±`half_width` (deg).
+
+    Example: `AnalysisVectors(calibration).coloured(setting, x, y, teff)` are the responses (point, camera, 3) of all
+    cameras to I, q and u of stars at x, y.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -113,7 +119,9 @@ class AnalysisVectors:
     # ------------------------------------------------------------------------------------ asking
 
     def reduced(self, settings: Settings) -> Settings:
-        """The settings, equal where these optics are: fewer distinct ones."""
+        """The settings with numbers that make no difference to these optics made equal, so that fewer distinct ones are
+        left.
+        """
         depends, neutral = needs(self.instrument).conditions, Settings.default(len(settings))
         patched = self.instrument.patched()
         return dataclasses.replace(
@@ -126,16 +134,18 @@ class AnalysisVectors:
             },
         )
 
-    def at(self, setting: Settings, x: Vector, y: Vector) -> Float[np.ndarray, "p c k 3"]:
+    def at(self, setting: Settings, x: OfPoints, y: OfPoints) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) in one setting, for the spectra that `colour_weights` mixes."""
         return self._kept(self._vector_table, setting)(x, y).reshape(len(x), COLOURS + 1, self.cameras, 3)
 
-    def coloured(self, setting: Settings, x: Vector, y: Vector, teff: Vector | None = None) -> Vectors:
+    def coloured(
+        self, setting: Settings, x: OfPoints, y: OfPoints, teff: OfPoints | None = None
+    ) -> LinearVectors:
         """Vectors (point, camera, Stokes) for sources of colour temperature `teff` (K; NaN, None: flat)."""
         teff = np.full(len(x), np.nan) if teff is None else teff
         return np.einsum("pc,pcks->pks", colour_weights(teff, COLOURS), self.at(setting, x, y))
 
-    def derivatives(self, setting: Settings, x: Vector, y: Vector, teff: Vector) -> Local:
+    def derivatives(self, setting: Settings, x: OfPoints, y: OfPoints, teff: OfPoints) -> Local:
         """Derivatives of the vectors to the plain parameters that are not certain, and to the local throughputs."""
         weights = colour_weights(teff, DERIVATIVE_COLOURS)
         plain = self.plain
@@ -147,7 +157,7 @@ class AnalysisVectors:
 
     @functools.cached_property
     def acting(self) -> Mapping[int, Effect]:
-        """Mistakes that could hide and act on starlight, by number: effects at their sizes."""
+        """Undetected errors that act on starlight itself, by number: effects at their sizes."""
         return acting_effects(self.calibration)
 
     @functools.cached_property
@@ -156,7 +166,7 @@ class AnalysisVectors:
         angles = {number: turn_of(self.instrument, effect) for number, effect in self.acting.items()}
         return {number: turn for number, turn in angles.items() if turn}
 
-    def added(self, setting: Settings, x: Vector, y: Vector) -> dict[int, Vectors]:
+    def added(self, setting: Settings, x: OfPoints, y: OfPoints) -> dict[int, LinearVectors]:
         """Change of the vectors by each effect of `acting` that is in the beam, for a flat spectrum."""
         if setting.key not in self._acting_in:
             acting = ((n, e) for n, e in self.acting.items() if acts_in(e, self.instrument, setting))
@@ -169,20 +179,26 @@ class AnalysisVectors:
         return dict(zip(acting, np.moveaxis(values, 1, 0), strict=True))
 
     def to_parameters(
-        self, plain: Float[np.ndarray, "p 2 o"], throughput: Float[np.ndarray, "p 2 k"], x: Vector, y: Vector
+        self,
+        plain: Float[np.ndarray, "p 2 o"],
+        throughput: Float[np.ndarray, "p 2 k"],
+        x: OfPoints,
+        y: OfPoints,
     ) -> Float[np.ndarray, "p 2 n"]:
-        """Derivatives to `parameters`: those to the local throughputs are spread over the series."""
+        """Derivatives in `parameters` (p, 2, n): those in the local throughputs are spread over the terms of the
+        series.
+        """
         spread = through_series(throughput[:, :, None], self.basis(x, y)[:, None, None])
         return np.concatenate([plain, spread], axis=-1)
 
-    def basis(self, x: Vector, y: Vector) -> Float[np.ndarray, "p t"]:
+    def basis(self, x: OfPoints, y: OfPoints) -> Float[np.ndarray, "p t"]:
         """Terms of the throughput series at field positions (deg)."""
         return self.instrument.throughput.basis(x, y)
 
     # ------------------------------------------------------------------------------------ making the tables
 
     def exact(
-        self, setting: Settings, x: Vector, y: Vector, teff: Sequence[float] = (np.nan,)
+        self, setting: Settings, x: OfPoints, y: OfPoints, teff: Sequence[float] = (np.nan,)
     ) -> Float[np.ndarray, "p c k 3"]:
         """Vectors (point, colour, camera, Stokes) without any table; `teff` NaN is a flat spectrum."""
         plan, bands = self._plan(setting, teff)
@@ -210,10 +226,10 @@ class AnalysisVectors:
         teff = [np.nan, *nodes]
         weights = colour_weights(np.array(BETWEEN), COLOURS)
 
-        def exact(x: Vector, y: Vector) -> Values:
+        def exact(x: OfPoints, y: OfPoints) -> TableValues:
             return self.exact(setting, x, y, teff).reshape(len(x), -1)
 
-        def error(interpolated: Values, truth: Float[np.ndarray, "p t k 3"]) -> float:
+        def error(interpolated: TableValues, truth: Float[np.ndarray, "p t k 3"]) -> float:
             on_nodes = interpolated.reshape(len(interpolated), COLOURS + 1, self.cameras, 3)
             between = np.einsum("tc,pcks->ptks", weights, on_nodes)
             return float(np.abs(between - truth).max() / truth.max())
@@ -228,12 +244,12 @@ class AnalysisVectors:
         plain = plain_positions(self.instrument).size
         columns = np.concatenate([self._uncertain, plain + np.arange(self.cameras)])
 
-        def exact(x: Vector, y: Vector) -> Values:
+        def exact(x: OfPoints, y: OfPoints) -> TableValues:
             """Derivatives in the order point, (colour, camera, Stokes, parameter)."""
             values = vector_slopes(self.instrument, plan, x, y)
             return np.moveaxis(values[:, columns][:, :, bands], 1, -1).reshape(len(x), -1)
 
-        def error(interpolated: Values, truth: Values) -> float:
+        def error(interpolated: TableValues, truth: TableValues) -> float:
             interpolated, truth = (values.reshape(-1, len(columns)) for values in (interpolated, truth))
             largest = np.abs(truth).max(axis=0)
             off = np.abs(interpolated - truth).max(axis=0) / np.where(largest > 0, largest, 1.0)
@@ -245,16 +261,16 @@ class AnalysisVectors:
         filters = self.calibration.curves(setting)
         flat = dataclasses.replace(setting, teff=np.full(1, np.nan))
 
-        def vectors(instrument: Instrument, x: Vector, y: Vector) -> Vectors:
+        def vectors(instrument: Instrument, x: OfPoints, y: OfPoints) -> LinearVectors:
             return sky_vectors(instrument, plan_for_settings(instrument, flat, filters), x, y)[:, 0, :, :3]
 
-        def exact(x: Vector, y: Vector) -> Values:
+        def exact(x: OfPoints, y: OfPoints) -> TableValues:
             """Change of the vectors in the order point, (effect, camera, Stokes)."""
             bare = vectors(self.instrument, x, y)
             changes = [vectors(with_effect(self.instrument, one), x, y) - bare for one in acting.values()]
             return np.stack(changes, axis=1).reshape(len(x), -1)
 
-        def error(interpolated: Values, truth: Values) -> float:
+        def error(interpolated: TableValues, truth: TableValues) -> float:
             return float(np.abs(interpolated - truth).max() / max(np.abs(truth).max(), 1e-300))
 
         return self._accurate(exact, DERIVATIVE_NODES, ADDED_TOLERANCE, error)

@@ -43,6 +43,7 @@ from walop_jax.instruments.description import parsed
 from walop_jax.io.code import software_versions
 from walop_jax.io.display import Display
 from walop_jax.io.errors import DataError, PathLike, nearest
+from walop_jax.io.shapes import Matrix, OfPoints, Vector
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.dependence import left_behind, needs
@@ -51,16 +52,14 @@ from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 
 if TYPE_CHECKING:
     from walop_jax.fit.refit import FitResult
 
-Matrix = Float[np.ndarray, "n n"]
-Positions = Float[np.ndarray, " p"]  # deg
 Elements = Float[np.ndarray, "p m"]  # m21, m22, m23, m31, … at positions
-Covariances = Float[np.ndarray, "p m m"]
-Columns = dict[str, tuple[np.ndarray, str]]  # values, description
+MatrixCovariances = Float[np.ndarray, "p m m"]
+MatrixColumns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
 MAP_NODES = (18, 24, 30)  # per side, of the tables that the maps are made of
@@ -79,10 +78,11 @@ def now() -> str:
 
 
 class Written(NamedTuple):
-    """What the file of a calibration holds beside the calibration itself, as it stands there.
+    """What the file of a calibration holds beside the calibration itself, exactly as it stands there.
 
-    `maps` are those of the matrix over the field, `model_lines` the lines of the model file of the fit, `description`
-    those of the description of an instrument that does not come with the package, `content` is the content hash.
+    `maps` are the maps of the matrix over the field, `model_lines` the lines of the model file of the fit,
+    `description` the lines of the description of an instrument that does not come with the package, `content` is the
+    content hash.
     """
 
     maps: MatrixMaps
@@ -92,9 +92,9 @@ class Written(NamedTuple):
 
 
 class UnavailableInstrument(Instrument):
-    """Stands in a model for an instrument that this process cannot build: asking it for anything raises the reason.
+    """Takes the place of an instrument that this process cannot build: asking it for anything raises the reason.
 
-    For example the fit had an effect of one's own, and the file that defines the effect was not given.
+    For example the fit had an effect of a user's own, and the file that defines the effect was not given.
     """
 
     @classmethod
@@ -118,7 +118,7 @@ class Calibration(Fitted):
     In memory and as a file it is the same: `Calibration.from_fit` makes it, `Calibration.read` reads it.
 
     `field` is (smallest x, largest x, smallest y, largest y) in degrees of the points that were used. `residuals` are
-    those of the model over the field, `hidden` are mistakes that would not have been detected; `date` is UTC,
+    those of the model over the field, `hidden` are systematic errors that would not have been detected; `date` is UTC,
     `versions` name the software. With `draws` of a posterior, matrices and their covariance are means over these
     instead of the linear propagation of `covariance`.
 
@@ -130,6 +130,11 @@ class Calibration(Fitted):
     >>> m.shape, covariance.shape
     ((6,), (6, 6))
     """
+
+    _working = (
+        "written", "with_covariance", "fitted", "widened", "of_deviations", "over_field", "new_maps", "model_lines",
+        "provenance", "matrix_columns", "raster", "curves",
+    )  # fmt: skip
 
     model: Model
     values: Vector
@@ -182,7 +187,7 @@ class Calibration(Fitted):
     def from_fit(cls, result: FitResult, residuals: ResidualMap | None = None) -> Calibration:
         """The calibration by a fit, with the verdict on it: of a diagnosis the mean over the models still possible.
 
-        `residuals` are those over the field (`residual_map`), worth its pass for large sets.
+        `residuals` are the map over the field (`residual_map`), which is worth one more pass for large sets.
         Raises RuntimeError for a fit without a verdict.
         """
         calset = result.calset
@@ -196,7 +201,7 @@ class Calibration(Fitted):
             sources=calset.sources,
             site=calset.site,
             origin=calset.origin,
-            field=result.expansion.census.field,
+            field=result.expansion.used_data.field,
             inputs=calset.inputs,
             residuals=residuals,
             hidden=result.hidden,
@@ -204,7 +209,9 @@ class Calibration(Fitted):
         return calibration if result.alternatives is None else result.alternatives.averaged(calibration)
 
     def with_covariance(self, covariance: Float[np.ndarray, "f f"], errors_from: str) -> Calibration:
-        """The calibration with the covariance of a posterior of its fit, made of errors from `errors_from`, now."""
+        """The calibration, dated now, with the covariance of a posterior of its fit; `errors_from` says what that was
+        made of.
+        """
         verdict = dataclasses.replace(self.verdict, covariance_from="posterior", errors_from=errors_from)
         made = {"date": now(), "versions": software_versions()}
         return dataclasses.replace(self, covariance=self.widened(covariance), verdict=verdict, **made)
@@ -215,14 +222,14 @@ class Calibration(Fitted):
         return np.delete(np.arange(len(self.model.names)), self.model.positions(Deviations.name))
 
     def widened(self, covariance: Float[np.ndarray, "f f"]) -> Matrix:
-        """The covariance of all parameters, from another one of the parameters of the fit."""
+        """The covariance (n, n) of all parameters for another covariance (f, f) of the parameters of the fit."""
         total, fitted = self.of_deviations, self.fitted
         total[np.ix_(fitted, fitted)] += covariance
         return total
 
     @property
     def of_deviations(self) -> Matrix:
-        """The part of the covariance that deviations from descriptions, and undetected changes, make."""
+        """The part (n, n) of the covariance that deviations from descriptions, and undetected changes, make."""
         at = self.model.positions(Deviations.name)
         across = self.covariance[:, at]
         return across @ pseudo_inverse(self.covariance[np.ix_(at, at)], 1e-12) @ across.T
@@ -302,7 +309,7 @@ class Calibration(Fitted):
             m[inside], covariance[inside] = self._elements(x[inside], y[inside], settings[inside])
         return m.reshape(*shape, size), covariance.reshape(*shape, size, size)
 
-    def _elements(self, x: Positions, y: Positions, settings: Settings) -> tuple[Elements, Covariances]:
+    def _elements(self, x: OfPoints, y: OfPoints, settings: Settings) -> tuple[Elements, MatrixCovariances]:
         filters = self.curves(settings)
         if self.draws is not None:
             drawn = matrix_draws(self.model, self.draws, settings, filters, x, y)
@@ -314,8 +321,8 @@ class Calibration(Fitted):
         return values, covariance + of_structure(self.verdict.structure, values)
 
     def over_field(
-        self, x: Positions, y: Positions, settings: Settings, counts: Sequence[int], tolerance: float
-    ) -> tuple[Elements, Covariances, Float[np.ndarray, "p m n"]]:
+        self, x: OfPoints, y: OfPoints, settings: Settings, counts: Sequence[int], tolerance: float
+    ) -> tuple[Elements, MatrixCovariances, Float[np.ndarray, "p m n"]]:
         """Matrix, covariance and derivatives at many field positions (deg), interpolated (`slopes_over_field`).
 
         In one setting, a row of `settings`; from the covariance of the parameters, draws left aside.
@@ -339,12 +346,12 @@ class Calibration(Fitted):
 
     @property
     def usual_filter(self) -> str:
-        """SDSS-r, or the first filter of the exposures where they do not use that."""
+        """SDSS-r; or the filter of the first exposure, if no exposure uses SDSS-r."""
         used = [str(name) for name in np.unique(self.exposures.filter)]
         return DEFAULT_FILTER if DEFAULT_FILTER in used or not used else used[0]
 
     def raster(self, size: int) -> Float[np.ndarray, "2 p"]:
-        """X and Y (deg) of size × size places over the field, row by row."""
+        """X and Y (2, size²; deg) of size × size positions over the field, row by row."""
         low_x, high_x, low_y, high_y = self.field
         x, y = np.meshgrid(np.linspace(low_x, high_x, size), np.linspace(low_y, high_y, size))
         return np.stack([x.ravel(), y.ravel()])
@@ -380,9 +387,10 @@ class Calibration(Fitted):
         raise DataError(f"FILTER: the calibration has no filter {name!r}; {nearest(name, names)}")
 
     def flags(
-        self, x: Positions, y: Positions, settings: Settings, values: Elements | None = None
+        self, x: OfPoints, y: OfPoints, settings: Settings, values: Elements | None = None
     ) -> Int[np.ndarray, " p"]:
-        """Bits of `Quality` at field positions: beyond the field or the settings; for matrices, high cross-talk.
+        """Bits of `Quality` (p) at field positions: beyond the field or the settings; for matrices also high
+        cross-talk.
 
         A single arm sees one combination of q and u, which has no inverse: it is marked only where it sees neither.
         """
@@ -429,7 +437,7 @@ class Calibration(Fitted):
 
     @functools.cached_property
     def maps(self) -> MatrixMaps:
-        """The maps of its file, or made anew."""
+        """The maps of its file; made anew for a calibration that was not read."""
         written = self._as_written
         return self.new_maps() if written is None else written.maps
 
@@ -450,9 +458,9 @@ class Calibration(Fitted):
         return vars(self)["_written"]
 
     def content_hash(self) -> str:
-        """The content hash of the file that it was read from, or of the one that it would be written as.
+        """The content hash of the file that it was read from, or of the file that it would be written as.
 
-        SHA-256 of the instrument as calibrated: not of dates, paths and versions.
+        It is the SHA-256 of the instrument as calibrated, not of dates, paths and versions.
         """
         from walop_jax.calibration.product import content_of, hdus_of
 
@@ -475,8 +483,8 @@ class Calibration(Fitted):
         }
 
     def matrix_columns(
-        self, x: Positions, y: Positions, settings: Settings, outside: Bool[np.ndarray, " p"]
-    ) -> Columns:
+        self, x: OfPoints, y: OfPoints, settings: Settings, outside: Bool[np.ndarray, " p"]
+    ) -> MatrixColumns:
         """Matrix elements, standard errors and FLAG, each with its description; NaN and 32 where `outside`."""
         inside = np.flatnonzero(~outside)
         elements, covariance = self.matrix(x[inside], y[inside], settings[inside])
@@ -487,7 +495,7 @@ class Calibration(Fitted):
         flag[inside] = self.flags(x[inside], y[inside], settings[inside], values[inside])
         names = matrix_names(values.shape[1] // 3)
         about = [f"element {name.lower()} of the instrument matrix" for name in names]
-        columns: Columns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
+        columns: MatrixColumns = dict(zip(names, zip(values.T, about, strict=True), strict=True))
         for name, column in zip(names, errors.T, strict=True):
             columns[f"{name}_ERR"] = column, f"standard error of {name}"
         if len(names) == 6:
@@ -499,7 +507,7 @@ class Calibration(Fitted):
 
 
 def design_of(instrument: str, description: Sequence[str]) -> Instrument:
-    """The instrument of the lines of a description, or without any that of the package of this name.
+    """The instrument that some lines describe; without lines, the instrument of this name that comes with the package.
 
     Its kinds of elements are those of the package and those that this process has defined. Raises `DataError`, with the
     class that is missing, for another kind.

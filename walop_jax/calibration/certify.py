@@ -29,7 +29,7 @@ MAP_TOLERANCE = 1e-7  # between maps in the file and maps of its parameters, on 
 DARKEST = 1e-4  # of the response to unpolarised light: what "less than no light" may be
 SINGULAR = 1e-12  # eigenvalue of a correlation that is 0 but for rounding
 UNMEASURED = 5e-4
-"""Error of q and u (median over the field) allowed to a mistake without any data on it."""
+"""Error of q and u (median over the field) allowed to an error on which there are no data at all."""
 _POINTS = 64
 OF_THE_SKY = "observe an unpolarised and a polarised standard, or the moonlit sky"
 
@@ -64,7 +64,7 @@ def lacks(
 ) -> Iterator[Finding]:
     """What lists of exposures, taken or planned, lack together for a go, whatever they count.
 
-    The faults that `inspect` would find, and the mistakes that `check` would not call measured.
+    The faults that `inspect` would find, and the systematic errors that `check` would not call measured.
     """
     yield from (finding for finding in about_exposures(*taken) if finding.severity == "fault")
     if not sees_the_sky(*taken):
@@ -79,7 +79,7 @@ def _verdict(calibration: Calibration) -> list[Check]:
     v, bits = calibration.verdict, calibration.verdict.quality
     unexplained, ill = bool(bits & Quality.UNEXPLAINED), bool(bits & Quality.ILL_CONDITIONED)
     reached = "the minimum was reached" if v.converged else "no"
-    why = [doubt.sentence for doubt in v.against if doubt.blocking and doubt.sentence]
+    why = [doubt.sentence for doubt in v.doubts if doubt.blocking and doubt.sentence]
     evidence = (f"χ²/dof = {v.chi2 / max(v.dof, 1):.4g}", *(() if unexplained else why[:1]))
     return [
         Check("converged", v.converged and not bits & Quality.NOT_CONVERGED, reached),
@@ -152,17 +152,19 @@ def _physics(calibration: Calibration) -> Check:
 
 
 def _protection(calibration: Calibration) -> Iterator[Check]:
-    """Mistakes that could hide, at the limits of the data; unmeasured ones fail beyond `UNMEASURED`."""
+    """Checks of the systematic errors that could hide, at the limits of the data; unmeasured ones fail beyond
+    `UNMEASURED`.
+    """
     if calibration.hidden is None:
         yield Check("protection", True, "undetectable errors were not computed")
         return
-    mistakes = could_hide(calibration)
-    stated = "no single mistake would move q and u by more than their errors"
-    if mistakes:
-        stated = f"{off_by(*mistakes[0].error)} from {mistakes[0].in_words}"
+    undetected = could_hide(calibration)
+    stated = "no single undetected error would move q and u by more than their errors"
+    if undetected:
+        stated = f"{off_by(*undetected[0].error)} from {undetected[0].in_words}"
     yield Check("protection", True, stated)
-    unseen = unmeasured(mistakes).items()
-    measured = not any(mistake.error[0] > UNMEASURED for _, mistake in unseen)
-    text = "; ".join(f"not {name}: {off_by(*mistake.error)} at the usual size" for name, mistake in unseen)
+    unseen = unmeasured(undetected).items()
+    measured = not any(each.error[0] > UNMEASURED for _, each in unseen)
+    text = "; ".join(f"not {name}: {off_by(*each.error)} at the usual size" for name, each in unseen)
     text = text or "; ".join(f"not {name}" for name in calibration.hidden.not_measured())
     yield Check("measured", measured, text or "all that acts on starlight")

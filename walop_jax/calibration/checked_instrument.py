@@ -31,8 +31,9 @@ LARGEST_FIELD = 0.3  # deg: beyond, a description does not cover the optics
 class CheckedInstrument(Displayed):
     """An instrument with the model of its parameters; `train` and `arms` name elements in the order light meets them.
 
-    `optical` are the parameters that enter the band integral, `conditions` those that the optics need of an exposure,
-    `retardance` is that of every plate by its place (waves, folded to 0 … ½), for 0.62 µm along the normal.
+    `optical` are the parameters that enter the band integral, `conditions` the conditions of an exposure that the
+    optics need, `retardance` the retardance of every plate by its place (waves, folded to 0 … ½), for 0.62 µm along the
+    normal.
     """
 
     instrument: Instrument
@@ -45,7 +46,7 @@ class CheckedInstrument(Displayed):
     retardance: dict[str, float]
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The instrument as plain data, for `--json`."""
         return {
             "name": self.instrument.name,
             "cameras": list(self.instrument.cameras.names),

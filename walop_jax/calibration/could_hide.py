@@ -1,14 +1,16 @@
-"""Mistakes that could hide: single ones below the detection limits of a calibration, and their errors of stars.
+"""Systematic errors that could hide below the detection limits of a calibration, and what they do to stars.
 
-A mistake moves the parameters of the fit by δθ; of what acts on starlight itself the light of stars changes as well.
-Stars are seen through m + δm and calibrated with m + ∂m/∂θ δθ, so that q and u are wrong by
+Each one is looked at by itself. Example: the angles of all standards are off by 0.3°, or a plate ahead of the polariser
+that no exposure through the polariser can show. It moves the parameters of the fit by δθ; if it is an effect that acts
+on starlight itself, it changes the light of stars as well. Stars are seen through m + δm and calibrated with
+m + ∂m/∂θ δθ, so that q and u are wrong by
 
-    M⁻¹ (δm − ∂m/∂θ δθ) (1, q, u),   and by 2 p δR where a mistake δR turns the sky against the instrument
+    M⁻¹ (δm − ∂m/∂θ δθ) (1, q, u),   and by 2 p δR where an error δR turns the sky against the instrument
 
-Every command that reports undetected mistakes calls `could_hide`.
+Every command that reports undetected errors calls `could_hide`.
 
 Symbols     m instrument matrix, M its part that acts on q, u; δm its change by an effect at its size; p = 5 %
-Limits      One mistake at a time; to first order in δθ.
+Limits      One error at a time; to first order in δθ.
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ from jaxtyping import Float
 from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
 from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrices
 from walop_jax.data.settings import Settings
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import per_cent, rounded
-from walop_jax.likelihood.field_table import Vector
 from walop_jax.model import light
 from walop_jax.model.effects import Change, Effect, EffectKind, effect_by_name, in_order
 from walop_jax.model.effects.base import Context
@@ -42,10 +44,12 @@ PLACES = 8  # along each axis of the field, where the errors are asked
 
 
 class CouldHide(NamedTuple):
-    """One mistake that could hide: `error` of q and u (stars with p ≤ 5 %) at `size`, median, largest over the field.
+    """A systematic error that could hide, and what it does to stars.
 
-    `kind` is `EFFECT` or `DATA` (`fit.verdict`); it is not `measured` where the data hold no information on it. One
-    that is not, and is `ahead`, is of the light from the sky before it meets the polariser.
+    At `size` (in `unit`), `error` is the error of q and u of stars with p ≤ 5 %: its median and its largest value over
+    the field. `kind` is `EFFECT` or `DATA` (`fit.verdict`), `remedy` the measurement that would show it. It is not
+    `measured` where the data hold no information on it; `ahead` is true for an unmeasured one that changes the light
+    from the sky before it meets the polariser.
     """
 
     name: str
@@ -59,19 +63,19 @@ class CouldHide(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """Name and size: that at which it would just be detected, or its standard error where that is smaller."""
+        """Name and size: the size at which it would just be detected, or its standard error where that is smaller."""
         size, unit = (self.size, self.unit) if self.unit else (100 * self.size, "%")
         what = "an error of" if self.measured else "not measured; usual size"
         return f"{self.name} ({what} {rounded(size, '.2g')} {unit})"
 
 
-def unmeasured(mistakes: Iterable[CouldHide]) -> dict[str, CouldHide]:
-    """Mistakes that the data do not measure, by their names: those together that one measurement would show."""
+def unmeasured(undetected: Iterable[CouldHide]) -> dict[str, CouldHide]:
+    """The errors on which the data hold no information, by name; those that one measurement shows are joined."""
     together: dict[str, list[CouldHide]] = {}
-    for mistake in mistakes:
-        if not mistake.measured:
-            together.setdefault(mistake.remedy, []).append(mistake)
-    return {", ".join(mistake.name for mistake in group): group[0] for group in together.values()}
+    for each in undetected:
+        if not each.measured:
+            together.setdefault(each.remedy, []).append(each)
+    return {", ".join(each.name for each in group): group[0] for group in together.values()}
 
 
 def off_by(median: float, largest: float, shown: str = "") -> str:
@@ -81,10 +85,10 @@ def off_by(median: float, largest: float, shown: str = "") -> str:
 
 
 def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
-    """The mistakes that could hide in the data of a calibration, the largest error in the median of the field first.
+    """The systematic errors that could hide in the data of a calibration, the one with the largest median error first.
 
-    In the usual setting, where one exposure gives q and u. None where they were not computed;
-    those without an error there are left out.
+    They are computed in the usual setting, in which one exposure gives q and u. An empty tuple comes back where they
+    were not computed; errors that do nothing to stars there are left out.
     """
     hidden = calibration.hidden
     if hidden is None or not len(hidden):
@@ -95,20 +99,20 @@ def could_hide(calibration: Calibration) -> tuple[CouldHide, ...]:
     errors = errors[:, np.isfinite(errors).all(axis=0)]
     if not errors.size:
         return ()
-    acting, mistakes = acting_effects(calibration), list[CouldHide]()
+    acting, undetected = acting_effects(calibration), list[CouldHide]()
     at_values = calibration.model.instrument(calibration.values)
-    for number, (m, of_field) in enumerate(zip(hidden.mistakes, errors, strict=True)):
+    for number, (m, of_field) in enumerate(zip(hidden.errors, errors, strict=True)):
         ahead = not m.measured and number in acting and is_ahead(at_values, acting[number])
         error = float(np.median(of_field)), float(of_field.max())
         if error[1] > 0.0:
-            mistakes.append(CouldHide(m.name, m.kind, m.size, m.unit, m.remedy, m.measured, ahead, error))
-    return tuple(sorted(mistakes, key=lambda mistake: (-mistake.error[0], -mistake.error[1])))
+            undetected.append(CouldHide(m.name, m.kind, m.size, m.unit, m.remedy, m.measured, ahead, error))
+    return tuple(sorted(undetected, key=lambda each: (-each.error[0], -each.error[1])))
 
 
 def hidden_errors(
-    calibration: Calibration, x: Vector, y: Vector, settings: Settings
+    calibration: Calibration, x: OfPoints, y: OfPoints, settings: Settings
 ) -> Float[np.ndarray, "s p"]:
-    """Error of q and u at field positions (deg) by each mistake that could hide; NaN where u is hardly measured."""
+    """Error (s, p) of q and u at field positions (deg) by each error that could hide; NaN where u is not measured."""
     hidden, instrument = calibration.hidden, calibration.model.instrument(calibration.values)
     assert hidden is not None
     filters = calibration.curves(settings)
@@ -140,15 +144,15 @@ def acting_effects(calibration: Calibration) -> Mapping[int, Effect]:
     context = effect_context(model.template, calibration.exposures)
     names = {kind.name for kind in known_effects(model)}
     effects = {}
-    for number, mistake in enumerate(() if hidden is None else hidden.mistakes):
-        values: dict[str, Any] = json.loads(mistake.acts) if mistake.acts else {}
+    for number, each in enumerate(() if hidden is None else hidden.errors):
+        values: dict[str, Any] = json.loads(each.acts) if each.acts else {}
         if (name := values.pop("effect", "")) in names:
             effects[number] = effect_by_name(name, known_effects(model)).of(context, **values)
     return effects
 
 
 def _changes(effect: Effect, instrument: Instrument) -> list[Change]:
-    """The changes of an effect, of any of its amplitudes."""
+    """The changes that the amplitudes of an effect make, of all amplitudes together."""
     bare = dataclasses.replace(instrument, effects=())
     return [change for terms in effect.first_order(bare) for _, change in terms]
 
@@ -161,14 +165,16 @@ def moves_with(effect: Effect, instrument: Instrument) -> frozenset[str]:
     prefixes: set[str] = set()
     for change in _changes(effect, bare):
         moved = {moving[name] for name in change.place.split(".") if name in moving}
-        if change.where in ("ahead of", "behind") or not moved:
+        if change.relation in ("ahead of", "behind") or not moved:
             return frozenset()
         prefixes |= moved
     return frozenset(prefixes)
 
 
 def acts_in(effect: Effect, instrument: Instrument, settings: Settings) -> bool:
-    """True if an effect does anything to the light of a star in a setting (one row): it is in the beam there."""
+    """True if an effect does anything to the light of a star in a setting (one row), that is if it is in the beam
+    there.
+    """
     changes = _changes(effect, instrument)
     if changes and all(change.kind in (*OF_POLARISER, "rotator") for change in changes):
         return False  # of sources, of the angle of the sky
@@ -190,10 +196,10 @@ def _telescope(instrument: Instrument) -> Float[np.ndarray, "4 4"]:
 def shown_by_the_sky_alone(
     instrument: Instrument, catalogue: Iterable[EffectKind], context: Context
 ) -> dict[str, float]:
-    """Amplitudes of effects that act ahead of the polariser, and their errors of q and u of stars at the usual size.
+    """Amplitudes of effects ahead of the polariser, by name, with their errors of q and u of stars at the usual size.
 
-    No exposure through the polariser shows them, whatever it counts. The error is the same in all cameras, all over the
-    field. None where one exposure does not give q and u, as in `could_hide`.
+    No exposure through the polariser shows them, however many there are. The error is the same in all cameras and all
+    over the field. An empty dictionary comes back where one exposure does not give q and u, as in `could_hide`.
     """
     if len(instrument.cameras.pairs) != 2:
         return {}
@@ -231,9 +237,9 @@ def turn_of(instrument: Instrument, effect: Effect) -> float:
 
 
 def change_by_effect(
-    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: Vector, y: Vector
+    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "p a 3"]:
-    """Instrument matrix with an effect at its size, less the one without, in one setting."""
+    """The instrument matrix (point, arm, 3) with an effect at its size, less the matrix without it, in one setting."""
     models = with_effect(instrument, effect), instrument
     after, before = (planned_matrices(m, plan_for_settings(m, setting, filters), x, y) for m in models)
     return after - before

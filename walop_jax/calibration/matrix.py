@@ -23,8 +23,9 @@ from walop_jax.data.grid import Grid
 from walop_jax.data.records import CalibrationSet, FilterCurve
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Structure
+from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits, optics
-from walop_jax.likelihood.field_table import Vector, accurate_table, details_of, in_batches
+from walop_jax.likelihood.field_table import accurate_table, details_of, in_batches
 from walop_jax.likelihood.optics import linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
@@ -62,10 +63,10 @@ def residual_names(arms: int) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class MatrixMaps:
-    """The elements of the instrument matrix over the field, for a look: order of `matrix_names`, three per arm.
+    """Maps of the elements of the instrument matrix over the field, for display; in the order of `matrix_names`.
 
-    For the filter named, a flat photon spectrum, and the moving elements at `positions` (deg by column prefix; those
-    not there are out). Raises ValueError for another number of planes.
+    They are for the filter named, a flat photon spectrum, and the moving elements at `positions` (deg, by the prefix of
+    their columns; an element without a position is out of the beam). Raises ValueError for another number of planes.
     """
 
     grid: Grid
@@ -80,12 +81,12 @@ class MatrixMaps:
 
     @property
     def arms(self) -> int:
-        """Number of arms."""
+        """Number of arms of the instrument, three maps for each."""
         return len(self.values) // 3
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the elements."""
+        """Names of the elements: M21, M22, …"""
         return matrix_names(self.arms)
 
 
@@ -93,9 +94,10 @@ class MatrixMaps:
 class ResidualMap:
     """Residuals of the smooth model in cells of the field: planes in the order of `residual_names`.
 
-    To be added to the matrix (throughput of an arm: relative); NaN where a cell has too few data. `chi2` is that of the
-    residuals before the correction, per degree of freedom. Through `filter`, with the moving elements at `positions`
-    (deg by column prefix; those not there are out). Raises ValueError for another number of planes.
+    They are to be added to the matrix elements (the throughput of an arm is a relative correction); NaN where a cell
+    has too few data. `chi2` is χ² per degree of freedom of the residuals before the correction. They are for `filter`,
+    with the moving elements at `positions` (deg, by the prefix of their columns; an element without a position is out
+    of the beam). Raises ValueError for another number of planes.
     """
 
     grid: Grid
@@ -112,16 +114,18 @@ class ResidualMap:
 
     @property
     def arms(self) -> int:
-        """Number of arms."""
+        """Number of arms of the instrument."""
         return (len(self.values) + 1) // 4
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the quantities."""
+        """Names of the planes, as `residual_names` gives them."""
         return residual_names(self.arms)
 
     def excess(self) -> dict[str, float]:
-        """Rms over the field of every quantity beyond its standard errors; negative if below, as chance has it."""
+        """Rms over the field of every quantity beyond its standard errors; negative where chance makes it smaller than
+        those.
+        """
         rms = {}
         for name, value, error in zip(self.names, self.values, self.errors, strict=True):
             finite = np.isfinite(value)
@@ -155,10 +159,11 @@ def _vectors_at(
 def _slopes_at(
     instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
-    """Analysis vectors for light from the sky, and their derivatives.
+    """Analysis vectors (p, b, k, 3) for light from the sky, and their derivatives (p, d, b, k, 3).
 
-    At rows of x, y (deg), and of colour temperature (0: flat), temperature and hour angle if these are not those of the
-    plan. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the place.
+    `columns` are x and y (deg) and, if they are not those of the plan, colour temperature (K, 0: flat), temperature and
+    hour angle. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the field
+    point.
     """
 
     def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
@@ -180,7 +185,7 @@ _slopes = compiled(_slopes_at, kept_as="slopes")  # of hundreds of places after 
 
 
 def analysis_vectors(
-    instrument: Instrument, plan: Plan, x: Vector, y: Vector, *, from_sky: bool = False
+    instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints, *, from_sky: bool = False
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
@@ -192,8 +197,10 @@ sky_vectors = functools.partial(analysis_vectors, from_sky=True)
 """Analysis vectors for light from the sky."""
 
 
-def vector_slopes(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Float[np.ndarray, "p d b k 3"]:
-    """Derivatives of `sky_vectors` in all parameters but the terms of the throughput, then in the throughputs there."""
+def vector_slopes(
+    instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints
+) -> Float[np.ndarray, "p d b k 3"]:
+    """Derivatives (p, d, b, k, 3) of `sky_vectors`: in all parameters but the series, then in the throughputs there."""
     return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
 
@@ -205,7 +212,7 @@ def _in_chunks(function: Callable[..., Any], *columns: Float[np.ndarray, " p"]) 
 # ----------------------------------------------------------------------------------------------------------- the matrix
 
 
-def planned_matrices(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Matrices:
+def planned_matrices(instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints) -> Matrices:
     """Instrument matrices at field positions (deg) in the one setting of a plan."""
     return light.instrument_matrix(sky_vectors(instrument, plan, x, y)[:, 0], instrument.cameras.pairs)
 
@@ -230,7 +237,7 @@ def _matrix_and_slopes(instrument: Instrument, plan: Plan) -> Callable[..., tupl
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
-    def at(*columns: Vector) -> tuple[np.ndarray, np.ndarray]:
+    def at(*columns: OfPoints) -> tuple[np.ndarray, np.ndarray]:
         vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
         basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
@@ -246,8 +253,8 @@ def matrices(
     instrument: Instrument,
     settings: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     covariance: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p m m"]]:
     """Elements of the instrument matrix (three for each arm) and their covariance at field positions (deg).
@@ -261,7 +268,7 @@ def matrices(
         plan = dataclasses.replace(plan_for_settings(instrument, layout, filters), work=len(x))
         exact = _matrix_and_slopes(instrument, plan)
 
-        def with_covariance(*columns: Vector, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
+        def with_covariance(*columns: OfPoints, exact: Any = exact) -> tuple[np.ndarray, np.ndarray]:
             elements, slopes = (a.reshape(len(a), size, *a.shape[3:]) for a in exact(*columns))
             return elements, slopes @ covariance @ np.swapaxes(slopes, 1, 2)
 
@@ -269,13 +276,18 @@ def matrices(
     return values, errors
 
 
-def _numbers(settings: Settings) -> tuple[Vector, Vector, Vector]:
+def _numbers(settings: Settings) -> tuple[OfPoints, OfPoints, OfPoints]:
     """Settings that enter a program as numbers: colour temperature (0: flat), temperature, hour angle."""
     return np.nan_to_num(settings.teff), settings.temperature, settings.hour_angle
 
 
 def matrix_draws(
-    model: Model, draws: Float[np.ndarray, "d n"], settings: Settings, filters: Filters, x: Vector, y: Vector
+    model: Model,
+    draws: Float[np.ndarray, "d n"],
+    settings: Settings,
+    filters: Filters,
+    x: OfPoints,
+    y: OfPoints,
 ) -> Float[np.ndarray, "d p m"]:
     """Elements of the instrument matrix at field positions (deg) for every draw of all parameters."""
     result = np.empty((len(draws), len(x), 3 * len(model.template.cameras.pairs)))
@@ -291,7 +303,7 @@ def matrix_draws(
 
 
 def matrix_slopes(
-    instrument: Instrument, setting: Settings, filters: Filters, x: Vector, y: Vector
+    instrument: Instrument, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
 ) -> tuple[Matrices, Slopes]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
@@ -308,17 +320,17 @@ def slopes_over_field(
     instrument: Instrument,
     setting: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     covariance: Float[np.ndarray, "n n"],
     counts: Sequence[int],
     tolerance: float,
 ) -> tuple[Matrices, Slopes]:
-    """`matrix_slopes` at many positions, interpolated where the optics are smooth.
+    """The matrices and derivatives of `matrix_slopes` at many positions, interpolated where the optics are smooth.
 
-    `counts` of nodes per side are tried in turn, until standard errors are right to `tolerance` (relative) wherever
-    that is checked (`field_table.held_out`). No table is tried that has more nodes than half of the positions, nor
-    beside local features, which none follows: it would cost more than the positions themselves.
+    Numbers of nodes per side (`counts`) are tried in turn, until standard errors are right to `tolerance` (relative)
+    wherever that is checked (`field_table.held_out`). No table is tried that has more nodes than half of the positions,
+    as it would cost more than the positions themselves, and none beside local features, which no table follows.
     """
     exact = functools.partial(matrix_slopes, instrument, setting, filters)
 
@@ -336,10 +348,10 @@ def slopes_over_field(
 
 
 def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p m m"]:
-    """Contribution of the structure of field points to the covariance of the matrix at a place.
+    """Covariance (p, m, m) of the matrix elements by structure of the field that is finer than the model.
 
-    Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their
-    responses to q and u the last two by half of their difference.
+    Gains g of the two cameras of an arm change its elements by (g₁ − g₂)/2 · (1 − m₁², −m₁m₂, −m₁m₃), their responses
+    to q and u the last two by half of their difference.
     """
     size = values.shape[1]
     added = np.zeros((len(values), size, size))
@@ -356,11 +368,14 @@ def effect_slopes(
     instrument: Instrument,
     setting: Settings,
     filters: Filters,
-    x: Vector,
-    y: Vector,
+    x: OfPoints,
+    y: OfPoints,
     effects: tuple[Effect, ...],
 ) -> Float[np.ndarray, "p a 3 e"]:
-    """Derivatives of the matrix to the amplitudes of neutral effects, in order; parts outside the matrix have none."""
+    """Derivatives (point, arm, element, amplitude) of the matrix in the amplitudes of neutral effects, in their order.
+
+    They are 0 for parts of an effect that do not act on the matrix.
+    """
     if not effects:
         return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
     neutral, put = with_amplitudes(instrument, effects)
@@ -375,7 +390,7 @@ def effect_slopes(
 
 
 def first_setting(calset: CalibrationSet, instrument: Instrument, exposure: int = 0) -> Settings:
-    """Filter and positions of an exposure of a set, its first, all else as by default."""
+    """The setting of one exposure of a set, by default the first: its filter and positions; all else as by default."""
     first = Settings.of(calset.exposures[exposure : exposure + 1], instrument.patched().moving())
     return Settings.default(1, str(first.filter[0])).at(**first.positions)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,15 @@ from walop_jax.io.text import per_cent, with_error, with_minus_sign
 
 
 class MatrixTable(Table):
-    """Field points with the instrument matrix; a few of them are printed as elements with their errors.
+    """Field points with the instrument matrix; a few rows are printed as elements with their errors.
 
-    `meanings` are those of the bits of FLAG.
+    `meanings` are the meanings of the bits of FLAG; `reading` writes a reading of a moving element, given by the prefix
+    of its columns, with its unit.
     """
 
     FEW = 4
     meanings: Mapping[int, str] = {}
+    reading: Callable[[str, float], str] = staticmethod(lambda prefix, reading: f"{reading:g}°")
 
     def __str__(self) -> str:
         complete = {"X", "Y"} <= set(self.colnames) and self._elements()
@@ -43,7 +45,9 @@ class MatrixTable(Table):
         width = max(map(len, cells)) + 3
         # `matrix` itself writes both columns; those of a user's table may be texts, or masked.
         inside = [name[:-3] for name in self.colnames if name.endswith("_IN") and self[name][row] is np.True_]
-        stand = "".join(f", {prefix} at {number(f'{prefix}_ANGLE'):g}°" for prefix in inside)
+        stand = "".join(
+            f", {prefix} at {self.reading(prefix, number(f'{prefix}_ANGLE'))}" for prefix in inside
+        )
         lines = [f"field point X {x}, Y {y}{stand}"]
         rows = (cells[k : k + 3] for k in range(0, len(cells), 3))
         lines += ["  " + "".join(f"{cell:<{width}}" for cell in row) for row in rows]

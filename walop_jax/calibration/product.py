@@ -35,7 +35,7 @@ from walop_jax.data.kinds import CALIBRATION_PLATE, PREFIX
 from walop_jax.data.records import InputFile, Site, Sources
 from walop_jax.data.schema import Column, column_names, read_table, table_rules
 from walop_jax.data.units import Place
-from walop_jax.fit.verdict import STATED, Hidden, Mistake, Structure, Verdict
+from walop_jax.fit.verdict import STATED, Hidden, Structure, UndetectedError, Verdict
 from walop_jax.instruments.description import shipped
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import PathLike, errors_naming, fail
@@ -72,8 +72,10 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
 """Tables and their columns, EXPOSURES apart, whose columns depend on the instrument."""
 
 _RESIDUALS = {"RESIDUAL": "values", "RESIDUAL_ERR": "errors", "RESIDUAL_CHI2": "chi2"}
-_MISTAKE = dict(zip(Mistake._fields, ("HIDE", "SIZE", "UNIT", "HKIND", "CURE", "ACTS", "SEEN"), strict=True))
-"""Numbered words of HIDDEN by the field of `Mistake` that each one is."""
+_WORDS_OF_HIDDEN = dict(
+    zip(UndetectedError._fields, ("HIDE", "SIZE", "UNIT", "HKIND", "CURE", "ACTS", "SEEN"), strict=True)
+)
+"""Numbered words of HIDDEN by the field of `UndetectedError` that each one is."""
 _FIELD = ("FIELDXMI", "FIELDXMA", "FIELDYMI", "FIELDYMA")
 _FIRST_KINDS = ("clp", "moon", "standard", "flux")  # of version 1
 _MATRIX_IMAGE = re.compile(r"M([1-9][0-9]{0,2})[123](_ERR)?")
@@ -271,12 +273,12 @@ def _residual_hdus(residuals: ResidualMap) -> list[fits.ImageHDU]:
 
 
 def _hidden_hdu(hidden: Hidden) -> fits.ImageHDU:
-    """An image (mistake, parameter) of the shifts of the parameters by each mistake; no data where there is none."""
+    """An image (undetected error, parameter) of the shifts of the parameters by each error; no data without any."""
     hdu = fits.ImageHDU(hidden.changes if len(hidden) else None, name="HIDDEN")
-    for number, mistake in enumerate(hidden.mistakes, start=1):
-        for field, value in mistake._asdict().items():
+    for number, each in enumerate(hidden.errors, start=1):
+        for field, value in each._asdict().items():
             if field != "acts" or value:
-                hdu.header[f"{_MISTAKE[field]}{number}"] = (
+                hdu.header[f"{_WORDS_OF_HIDDEN[field]}{number}"] = (
                     in_ascii(value) if isinstance(value, str) else value
                 )
     return hdu
@@ -426,7 +428,7 @@ class _Reader:
         return _number(self.header, name, self.primary, missing)
 
     def flag(self, name: str) -> bool:
-        """T or F."""
+        """A truth value of the header: True for T, False for F."""
         value = self.header.get(name)
         if not isinstance(value, bool):
             raise self.primary.fail(f"is {value!r}, not T or F", name, _AGAIN)
@@ -531,20 +533,20 @@ class _Reader:
         )
 
     def hidden(self, parameters: int) -> Hidden | None:
-        """The mistakes of the extension HIDDEN; None in products without them."""
+        """The undetected errors of the extension HIDDEN; None in products without it."""
         if "HIDDEN" not in self.hdus:
             return None
         header, place = self.hdus["HIDDEN"].header, Place(self.path, "HIDDEN")
-        mistakes, usual = list[Mistake](), {"unit": "", **Mistake._field_defaults}
-        while f"HIDE{(number := len(mistakes) + 1)}" in header:
-            words = {field: f"{word}{number}" for field, word in _MISTAKE.items()}
+        undetected, usual = list[UndetectedError](), {"unit": "", **UndetectedError._field_defaults}
+        while f"HIDE{(number := len(undetected) + 1)}" in header:
+            words = {field: f"{word}{number}" for field, word in _WORDS_OF_HIDDEN.items()}
             size, seen = _number(header, words.pop("size"), place), header.get(words.pop("measured"))
             texts = {field: str(header.get(name, usual.get(field))) for field, name in words.items()}
-            mistakes.append(Mistake(size=size, measured=seen is not False, **texts))
-        changes = self.image("HIDDEN") if mistakes else np.zeros((0, parameters))
-        if changes.shape != (len(mistakes), parameters):
-            raise place.fail(f"has shape {changes.shape}, not {(len(mistakes), parameters)}", advice=_AGAIN)
-        return Hidden(tuple(mistakes), changes)
+            undetected.append(UndetectedError(size=size, measured=seen is not False, **texts))
+        changes = self.image("HIDDEN") if undetected else np.zeros((0, parameters))
+        if changes.shape != (len(undetected), parameters):
+            raise place.fail(f"has shape {changes.shape}, not {(len(undetected), parameters)}", advice=_AGAIN)
+        return Hidden(tuple(undetected), changes)
 
     def check_parameters(self, table: Mapping[str, Any], covariance: np.ndarray) -> None:
         """Raise `DataError` for parameters that are none, and a covariance that is not theirs."""

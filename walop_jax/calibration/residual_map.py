@@ -27,11 +27,12 @@ from walop_jax.calibration.matrix import ResidualMap, residual_names
 from walop_jax.data.cells import ORDER
 from walop_jax.data.grid import Grid
 from walop_jax.data.settings import Settings
-from walop_jax.fit.refit import FitResult, Vector
+from walop_jax.fit.refit import FitResult
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import engine, limits
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import project_flux
-from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, UsedData
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
@@ -67,10 +68,10 @@ def _point_sums(
     flux, residual = engine.point_residuals(instrument, plan, point, nodes)
     unit = engine.point_prediction(instrument, plan, point, nodes)
     vectors = engine.vectors_at(instrument, plan, point, nodes)[point.band]
-    stokes = light.stokes(instrument, point.sight(plan))
+    stokes = light.stokes(instrument, point.illumination(plan))
     weight = point.weight * chosen[:, None]
     change = _changes(vectors, stokes, unit, instrument.cameras.pairs) * (flux * weight)[:, None]
-    fixed, shared = plan.exposures.flux_known, engine.sharing(instrument, plan, point)
+    fixed, shared = plan.exposures.flux_known, engine.flux_groups(instrument, plan, point)
     change = jnp.moveaxis(change, 1, 0)  # exposures next to cameras
     change = jnp.moveaxis(project_flux(change, unit * weight, fixed, shared), 0, 1)
     measured = (point.weight[:, 0] > 0) & chosen
@@ -90,9 +91,9 @@ def _sums(*given: Any) -> Float[Array, "p n"]:
     )
 
 
-def cells_for(points: int, census: Census, points_per_cell: int = POINTS_PER_CELL) -> Grid:
-    """A grid of square-ish cells over the used part of the field: so many points in each, or more."""
-    low_x, high_x, low_y, high_y = census.field
+def cells_for(points: int, used_data: UsedData, points_per_cell: int = POINTS_PER_CELL) -> Grid:
+    """A grid of nearly square cells over the used part of the field, with at least `points_per_cell` points in each."""
+    low_x, high_x, low_y, high_y = used_data.field
     side = int(np.clip(np.sqrt(points / points_per_cell), 1, MOST_CELLS))
     width, height = (high_x - low_x) / side or 1.0, (high_y - low_y) / side or 1.0
     return Grid(side, side, (0.5, 0.5), (low_x, low_y), ((width, 0.0), (0.0, height)))
@@ -109,7 +110,9 @@ def cell_of(grid: Grid, x: Vector, y: Vector) -> Int[np.ndarray, " p"]:
 def _main_setting(
     settings: Settings, through: Bool[np.ndarray, " e"]
 ) -> tuple[Settings, Bool[np.ndarray, " e"]]:
-    """The setting with the most exposures `through` the polariser, all else out preferred, and its exposures."""
+    """The setting that most exposures `through` the polariser have, if possible with all other elements out; and its
+    exposures.
+    """
 
     def preferred(layout: tuple[Settings, Int[np.ndarray, " r"]]) -> tuple[object, ...]:
         setting, rows = layout
@@ -129,15 +132,15 @@ def residual_map(result: FitResult) -> ResidualMap:
 
 
 def residual_map_at(likelihood: Likelihood, values: Vector, near: Expansion | None = None) -> ResidualMap:
-    """As `residual_map`, at any full vector of parameter values; `near` is an expansion at similar ones."""
+    """The map of `residual_map` at any full vector of values (n); `near` is an expansion at similar values."""
     instrument = likelihood.model.instrument(values)
     nodes, _ = likelihood.nodes(instrument, near)
     exposures = likelihood.calset.exposures
     setting, chosen = _main_setting(Settings.of(exposures, likelihood.plan.moving), exposures.clp_in)
-    # The points of whole frames stand for many pixels: those of one block of them are a cell.
+    # The points of whole frames stand for many pixels: the points of one block of pixels are a cell.
     points_per_cell = ORDER**2 if likelihood.calset.fine is not None else POINTS_PER_CELL
-    census = likelihood.census if near is None else near.census
-    grid = cells_for(likelihood.layout.points, census, points_per_cell)
+    used_data = likelihood.used_data if near is None else near.used_data
+    grid = cells_for(likelihood.layout.points, used_data, points_per_cell)
     count = grid.pixels
 
     def work(number: int) -> Vector:

@@ -22,15 +22,15 @@ def summary(
     misfit: Misfit | None = None,
     residuals: ResidualMap | None = None,
 ) -> dict[str, Any]:
-    """The content of `summary.json` (docs: files) of a fit with a verdict; frozen parameters have sigma 0.
+    """The content of `summary.json` (docs: files) of a fit with a verdict; fixed parameters have sigma 0.
 
     `accuracy` is how well stars are known with it (the document of `science.field_accuracy`), `misfit` where the model
     fails, `residuals` are those over the field.
     """
     verdict = result.checked_verdict()
-    mistakes, keys = None, ("name", "size", "unit", "kind", "measured")
+    undetected, keys = None, ("name", "size", "unit", "kind", "measured")
     if result.hidden is not None:
-        mistakes = [{key: getattr(mistake, key) for key in keys} for mistake in result.hidden.mistakes]
+        undetected = [{key: getattr(each, key) for key in keys} for each in result.hidden.errors]
     parameters = {
         p.name: {"value": float(value), "sigma": float(sigma), "unit": p.unit}
         for p, value, sigma in zip(result.model.parameters, result.values, result.sigma, strict=True)
@@ -48,10 +48,10 @@ def summary(
         "cells": result.calset.cells,
         "trusted": verdict.trusted,
         "quality": int(verdict.quality),
-        "doubts": list(verdict.doubts),
+        "doubts": list(verdict.residual_doubts),
         "warnings": list(verdict.warnings),
         "structure": dataclasses.asdict(verdict.structure),
-        "hidden": mistakes,
+        "hidden": undetected,
         "accuracy_of_p": accuracy,
         "instrument": result.model.name,
         "effects": list(result.model.effect_names),

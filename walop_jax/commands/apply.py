@@ -87,10 +87,11 @@ def apply(
     """Turn the intensities of stars into Stokes parameters: Q, U, P, EVPA and their errors.
 
     X and Y in degrees, N and N_ERR (one value per camera) in electrons; optional ID, TEFF and TEFF_ERR (or BP_RP, of
-    Gaia), ROTATOR, FILTER, TEMP, HA, N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or
-    those of any other moving element. Rows of one ID (and filter) are one star; without ID those of one SOURCE_ID, or
-    at one RA and DEC: they are combined, wherever the moving elements stand, and all hold the same result. With ROTATOR
-    the results are on the sky. Two cameras see one combination of q and u: a star needs several settings.
+    Gaia), ROTATOR, FILTER, TEMP, HA, N_FLAG (or FLAG, or O1_FLAG, …; any bit: not used), and CHWP_ANGLE, CHWP_IN or the
+    same columns of any other moving element. Rows of one ID (and filter) are one star; without ID those of one
+    SOURCE_ID, or at one RA and DEC: they are combined, wherever the moving elements stand, and all hold the same
+    result. With ROTATOR the results are on the sky. Two cameras see one combination of q and u: a star needs several
+    settings.
 
     Errors hold photon noise and calibration; Q_COLOUR and U_COLOUR are the errors if TEFF were ignored, Q_HIDDEN and
     U_HIDDEN the largest shift by an error that the calibration data could not reveal (beside Q_ERR and U_ERR). FLAG: 16
@@ -108,10 +109,10 @@ def apply(
     signs and turns of ROTATOR, a shifted pointing, mirrored fields, magnitudes, filters, gains), and the one that mends
     it is said first.
 
-    Of a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: those of one night in a catalogue.
+    From a SURVEY (walop-jax stack) the calibration at the MJD of the stars is taken: a catalogue holds one night.
 
-    The catalogues of the cameras may be given as they are: they are made one as `walop-jax gather` does, which has
-    options for what they do not state (pointing, names of columns and words, gain).
+    The catalogues of the cameras may be given as they are: they are joined into one as `walop-jax gather` does, which
+    has options for what they do not state (pointing, names of columns and words, gain).
 
     With --each every CATALOGUE is reduced by itself into the folder OUT, in this process or by Dask (--workers,
     --scheduler): a table appears whole or not at all, and one that is there is not made again.
@@ -224,7 +225,7 @@ def stars_of(table: InputTable, held: Calibration, limit: float = math.inf) -> C
 
 
 def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Sequence[str]]:
-    """The table of a catalogue, of those of the cameras as one, with remarks on how they were made one."""
+    """The table of a catalogue, or of the catalogues of the cameras joined into one, and remarks on how."""
     if len(tables := several(catalogue)) == 1:
         return table_of(tables[0], {}), ()
     from walop_jax.data.user_tables import in_memory
@@ -237,7 +238,10 @@ def _table_of(catalogue: Any, held: Calibration | None) -> tuple[InputTable, Seq
 def calibration_for(
     given: Any, stars: InputTable, effects: Effects = None, *, force: bool = False
 ) -> Calibration:
-    """A calibration as `calibration_of` has it; of a survey that of the time of `stars`, of one night."""
+    """The calibration for some stars: as `calibration_of` gives it, or of a survey the calibration at their time.
+
+    Stars of a survey must be of one night.
+    """
     from walop_jax.nights.survey_folder import calibration_of_stars, is_survey, read_survey
 
     if is_survey(given):
@@ -295,7 +299,7 @@ def _apply_to_each(
     told = [outcome.text for outcome in ended if outcome.text] or [f"{output}: nothing was left to do"]
     reasons = [Doubt(Quality.CATALOGUE, f"{name}: {text}") for name, text in doubts.items()]
     subject = f"{len(doubted)} of {len(places)} tables" if doubted else str(output)
-    verdict = Verdict(against=tuple(reasons), subject=subject, stars="table by table, below")
+    verdict = Verdict(doubts=tuple(reasons), subject=subject, stars="table by table, below")
     document |= verdict.answers()
     text = "\n".join((verdict.display().text(), *told))
     about = list(dict.fromkeys(warnings))

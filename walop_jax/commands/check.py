@@ -240,8 +240,8 @@ def _outcome(
     """The answers as one, with everything that is printed and written of them."""
     from walop_jax.fit.verdict import Verdict
 
-    base = () if held is None else tuple(doubt for doubt in held.verdict.against if doubt.blocking)
-    verdict = Verdict(against=base if known.sets or known.stars else ()).with_doubts(
+    base = () if held is None else tuple(doubt for doubt in held.verdict.doubts if doubt.blocking)
+    verdict = Verdict(doubts=base if known.sets or known.stars else ()).with_doubts(
         [doubt for one in asked for doubt in one.against],
         subject=_subject(run, known, against),
         stars="; ".join(filter(None, (one.stars for one in asked))),

@@ -28,7 +28,7 @@ def cite(
 ) -> Outcome[tuple[Reference, ...]]:
     """List the sources of the physics in a fitted model, effects included.
 
-    In Python: a tuple of them, each with `what` it is the source of and the reference.
+    In Python: a tuple of `Reference`s, each with `what` it is the source of, and `source`, the works.
 
     >>> walop.cite(result)[1].what
     'polariser'

@@ -24,7 +24,7 @@ from walop_jax.io.atomic import atomic_path, check_output
 from walop_jax.io.errors import DataError, PathLike, nearest
 from walop_jax.io.folder import NotWrittenError, OutputFolder, check_apart, output_folder
 from walop_jax.io.names import NIGHTS, PRODUCT
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, Tell
 from walop_jax.io.text import json_text
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ LOG = logging.getLogger("walop_jax")
 LOG.addHandler(logging.NullHandler())
 
 T = TypeVar("T")
-Tell = Callable[[str], None]
 Writers = Mapping[str, str | Callable[[Path], object] | None]
 """Texts, or writers, of files by name; None: this result has no such file."""
 
@@ -44,8 +43,8 @@ Writers = Mapping[str, str | Callable[[Path], object] | None]
 class Option:
     """A parameter as an option of the program: `--name VALUE`, or `-o` as well; a `bool` is a switch.
 
-    `kind` is the type of the typed text (default: that of the annotation). `required` holds on the command line only,
-    where results that are not written would be lost. With `placed` it is an argument, known by its position.
+    `kind` is the type of the typed text (default: the type in the annotation). `required` holds on the command line
+    only, where results that are not written would be lost. With `placed` it is an argument, known by its position.
     """
 
     help: str
@@ -57,7 +56,7 @@ class Option:
     placed: bool = False
 
     def spelled(self, name: str) -> str:
-        """The word for it on the command line, where the parameter is called `name`."""
+        """The word on the command line for the parameter `name`: `--clip`, or `CALSET` for an argument."""
         return (self.metavar or name.upper()).strip("[]") if self.placed else f"--{name.replace('_', '-')}"
 
 
@@ -66,7 +65,7 @@ SHARED: Mapping[str, Option] = {
         "Calibration sets (FITS), fitted as one.", metavar="CALSET...", kind=list[Path], placed=True
     ),
     "model": Option(
-        "Model file: parameters free, tied, held; effects added.", metavar="MODEL.toml", kind=Path
+        "Model file: parameters free, fixed or tied; effects added.", metavar="MODEL.toml", kind=Path
     ),
     "instrument": Option(
         "An instrument that comes with the package, or a description file; see walop-jax instrument.",
@@ -131,7 +130,7 @@ class Job:
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def tell(self, text: str, stage: str = "") -> None:
-        """Report a step; `stage` is the one of the command that begins with it."""
+        """Report a step; `stage` is the stage of the command that begins with this step."""
         self.progress(Stage(text, stage) if stage else text)
 
     def begin(self, stage: str) -> None:
@@ -196,12 +195,13 @@ def figure_file(draw: Callable[..., Any], *data: Any) -> Callable[[Path], object
 class Outcome(Generic[T]):
     """Result of a command: `value` for Python, and the output of the program.
 
-    `document` is plain data (None: that of the value), to which `extra` is added; `display` is shown on a terminal
-    (None: that of the value), with the text `below` it; `text` is printed in its place. `files` are texts of files of
-    the output folder, or write them, each given its path; the document is written as the file `saved_as`, with the
-    display; the files `drop` go then. `warnings` are sentences to bear in mind. `failure` is the error (exit code 1),
-    `trusted` whether the result can be used (exit code 3 if not). `next` are command lines that one might want to type
-    next (`typed`; empty ones are left out). `markdown`: the text is laid out on a terminal.
+    `document` is plain data (None: the document of the value), to which `extra` is added; `display` is shown on a
+    terminal (None: the display of the value), with the text `below` it; `text` is printed in place of both. `files` are
+    the files of the output folder by name: a text, or a function that writes the file at a path. The document is
+    written as the file `saved_as`, together with the display; the files `drop` are removed then. `warnings` are
+    sentences to bear in mind. `failure` is the error (exit code 1), `trusted` whether the result can be used (exit code
+    3 if not). `next` are command lines that one might want to type next (`typed`; empty ones are left out). `markdown`:
+    the text is laid out on a terminal.
     """
 
     value: T
@@ -222,7 +222,7 @@ class Outcome(Generic[T]):
 
     @functools.cached_property
     def content(self) -> Any:
-        """The document, made once."""
+        """The document as plain data, with `extra` added; made once."""
         value: Any = self.value
         plain = value.document() if self.document is None else self.document
         return {**plain, **self.extra} if self.extra else plain
@@ -264,6 +264,13 @@ COMMON: Mapping[str, tuple[Any, str]] = {
 }  # fmt: skip
 """The parameters that every command takes in Python, with their defaults and kinds."""
 
+IN_PYTHON = {
+    "overwrite": "Replace outputs that exist.",
+    "progress": "Called with a line of text about each step; print, for example.",
+    "seed": "Seed of random numbers.",
+}
+"""Lines about these parameters, for `help`."""
+
 NUMBERS = ("bool", "int", "int | None", "float", "float | None")  # annotations of parameters that are no text
 
 OF_MODELS = ("free", "fixed", "fix", "frozen", "start", "prior", "priors", "tie", "ties", "bounds")
@@ -275,13 +282,13 @@ IN_THE_MODEL = "that is a matter of the model: model=base_model(calset).change('
 class Command(Generic[T]):
     """A command: `function` is the Python function, `run` the call of the program.
 
-    `stages` are those that its progress goes through, in their order; `writes` the files of its output folder, or
+    `stages` are the stages that its progress goes through, in their order; `writes` the files of its output folder, or
     "file" or "table" if `output` is a single one; () if the body looks after its outputs itself. `random`: its seed
     matters. `jax`: it computes. `outputs` are the arguments that name what is written. `elements`: it takes kinds of
-    elements of one's own, as commands with `effects` do.
-    `signature` is that of the Python function: its own arguments, their kinds spelt out, then those that all commands
-    share. `options` are those of its own arguments by name; beside those that are given it has those of `SHARED`.
-    `described` are all that it might have.
+    elements of a user's own, as commands with `effects` do. `signature` is the signature of the Python function: the
+    arguments of the body, with their types spelt out, then the arguments that all commands have. `options` are the
+    options of the arguments of the body by name: those that are given, and those of `SHARED`. `described` are all
+    options that it might have.
     """
 
     body: Callable[..., Outcome[T]]
@@ -357,7 +364,10 @@ class Command(Generic[T]):
         del call.__dict__["__wrapped__"]
         call.__signature__ = self.signature  # type: ignore[attr-defined]
         call.command = self  # type: ignore[attr-defined]
-        described = [f"{name}: {option.help}" for name, option in self.options.items()]
+        told = {name: option.help for name, option in self.options.items()} | {
+            name: help for name, help in IN_PYTHON.items() if name in self.signature.parameters
+        }
+        described = [f"{name}: {help}" for name, help in told.items()]
         call.__doc__ = python_first(inspect.cleandoc(self.body.__doc__ or ""), "\n".join(described))
         return call
 
@@ -420,7 +430,7 @@ class Command(Generic[T]):
 
 
 def _paths_in(given: Any) -> list[PathLike]:
-    """The paths that an argument consists of: one, or those in a list; of a run its folder."""
+    """The paths that an argument consists of: one, or those of a list; for a run the path of its folder."""
     entries = (getattr(entry, "folder", entry) for entry in several(given))
     return [entry for entry in entries if isinstance(entry, str | os.PathLike)]
 

@@ -31,7 +31,7 @@ def demo(job: Job, *, output: PathLike = "walop-jax-demo") -> Outcome[FitResult]
     The stars are simulated as well, as the same instrument sees them: FOLDER/stars.fits, with true q and u in
     FOLDER/stars_truth.json; FOLDER/stars_corrected.fits is what walop-jax apply makes of them.
 
-    In Python: the fit.
+    In Python: the fit, a `FitResult`.
 
     >>> walop.demo(output="there")  # doctest: +SKIP
     """

@@ -18,7 +18,7 @@ def docs(job: Job, topic: str | None = None) -> Outcome[str]:
 
     Recipes, conventions, file formats, the model, effects, how to add an effect or an instrument, vocabulary, sources.
 
-    In Python: its text.
+    In Python: the text of the page, or the list.
 
     >>> print(walop.docs("conventions").splitlines()[0])
     # Conventions

@@ -37,11 +37,11 @@ def exposures(
 ) -> Outcome[Any]:
     """Make the table EXPOSURES of a calibration set from the records of an observatory.
 
-    WORDS.toml assigns header words (keys of a log, columns of a table) to columns, in which unit, and what
-    is made of it (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
+    WORDS.toml says which header word (key of a log, column of a table) is which column, in which unit it is, and how it
+    is converted (walop-jax docs files). Words that are missing, units that do not fit and values that cannot be meant
     are errors, with file and word. An executed schedule (format v4) needs the numbers of its filters alone.
 
-    In Python: an astropy table; its columns are those of `from_arrays`.
+    In Python: an astropy table, with the columns that `from_arrays` takes.
 
     >>> walop.exposures(["night/0001.fits", "night/0002.fits"], words="words.toml")  # doctest: +SKIP
     """

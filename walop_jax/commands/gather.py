@@ -74,20 +74,20 @@ def gather(
     drop_blends: bool = False,
     instrument: InstrumentLike = None,
 ) -> Outcome[Any]:
-    """Make one catalogue, a row a star, of those of the cameras.
+    """Make one catalogue, with a row for each star, of the catalogues of the cameras.
 
     Catalogues of SExtractor (FITS_LDAC, FITS, ASCII_HEAD) or photutils (ECSV) are read as they are, of other programs
     with a small file that names their columns. Positions of the cameras are registered, stars matched on the sky; a
     camera whose positions are shifted or rotated, or that lacks stars, is named. X and Y are made of right ascension,
-    declination and the pointing, ROTATOR is that at the star. SOURCE_ID, BP_RP, TEFF and parallaxes go with the stars.
-    Words of the exposure are read from the header of the image, of the table, and the primary header; a contradiction
-    is an error. Directions of another equinox are made ICRS.
+    declination and the pointing; ROTATOR is the position angle at the star. SOURCE_ID, BP_RP, TEFF and parallaxes go
+    with the stars. Words of the exposure are read from the header of the image, of the table, and the primary header; a
+    contradiction is an error. Directions of another equinox are made ICRS.
 
     Stars flagged only as having a neighbour or as deblended are used, with a remark, unless --drop-blends is given.
     A table of Gaia is moved to the time of the exposure by its proper motions; of several candidates position and
     magnitude decide, and where they cannot none is taken (ID_FLAG).
 
-    In Python: an astropy table.
+    In Python: an astropy table with a row for each star.
 
     >>> stars = walop.gather(["O1.fits", "E1.fits", "O2.fits", "E2.fits"], rotator=0.0)  # doctest: +SKIP
     """

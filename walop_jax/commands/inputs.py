@@ -82,7 +82,7 @@ def paths_of(data: Sets) -> tuple[PathLike, ...]:
 
 
 def set_of(data: Sets, instrument: Instrument | None = None, cells: int | None = None) -> CalibrationSet:
-    """A checked set: files are checked as they are read, tables in memory here; `cells` are those of whole frames."""
+    """A checked set: files are checked as they are read, tables in memory here; `cells` as for `read`."""
     from walop_jax import CalibrationSet
     from walop_jax.data.calset import checked, read_calibration_set
     from walop_jax.data.kinds import KINDS
@@ -105,11 +105,11 @@ def set_and_model(
     output: PathLike | None = None,
     cells: int | None = None,
 ) -> tuple[CalibrationSet, Model]:
-    """Calibration sets as one, and the model to fit to them.
+    """Calibration sets joined into one, and the model to fit to it.
 
-    `model` is one, or a model file (None: the base model); `instrument` as designed, or its name or description file
-    (None: that of the sets); `effects` are those that a model file may name. With `output` the folder of a
-    run is written: it is made from files, so that it can be made again. `cells` are those of whole frames.
+    `model` is a model, or a model file (None: the base model); `instrument` the instrument as designed, or its name or
+    description file (None: the instrument of the sets); `effects` are those that a model file may name; `cells` as for
+    `read`. With `output` the folder of a run is written: it must then be made from files, so that it can be made again.
 
     Raises `DataError` for files that cannot be read, ValueError, naming the file, for a model that does not fit.
     """
@@ -167,7 +167,7 @@ def save(
 
 
 def shown_with_accuracy(result: FitResult, accuracy: FieldAccuracy | None) -> Display:
-    """What is shown of a fit, headed by the verdict on it for stars, and by how well these are known with it."""
+    """What is shown of a fit, headed by the verdict on it for stars and by how well stars are known with it."""
     from walop_jax.science.field_accuracy import verdict_of_fit
 
     shown = result.display()
@@ -176,7 +176,7 @@ def shown_with_accuracy(result: FitResult, accuracy: FieldAccuracy | None) -> Di
     verdict = verdict_of_fit(result, accuracy)
     if accuracy is None:
         return verdict.on_top_of(shown)
-    # The accuracy names the mistakes that could hide with their effect on stars.
+    # The accuracy names the systematic errors that could hide, with their effect on stars.
     hidden = "" if result.hidden is None else result.hidden.in_words()
     notes = tuple(note for note in shown.notes if note != hidden)
     shown = dataclasses.replace(

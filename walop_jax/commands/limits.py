@@ -53,12 +53,12 @@ def limits(
 ) -> Outcome[DetectionLimits]:
     """Compute the size at which every effect would be detected and named in calibration sets.
 
-    And what those may be that are too small: the largest error of q and u that a single effect can make over the field
-    without being detected. An observing plan (TOML, see walop-jax docs files) gives the same before any data are taken,
-    over instruments as they may be built.
+    It also gives the largest error of q and u that a single effect too small to be detected can make over the field. An
+    observing plan (TOML, see walop-jax docs files) gives the same before any data are taken, over instruments as they
+    may be built.
 
-    In Python: `DetectionLimits`, of a fit, an observing plan, or what `refit` takes; its `to_table()` is a row for each
-    effect and parameter. Raises ValueError for a fit that does not converge.
+    In Python: `DetectionLimits`, for a fit, an observing plan, or what `refit` takes; its `to_table()` has a row for
+    each effect and parameter. Raises ValueError for a fit that does not converge.
 
     >>> walop.limits("night.fits").protection_in_words()  # doctest: +SKIP
     """

@@ -47,7 +47,7 @@ def matrix(
     a star with p ≤ 5 %, from the calibration alone.
 
     X and Y in degrees; optional TEFF, FILTER, TEMP, HA (absent: flat spectrum, SDSS-r, 10 Celsius, on the
-    meridian), and CHWP_ANGLE, CHWP_IN, or those of any other moving element of the instrument (absent: out).
+    meridian), and CHWP_ANGLE, CHWP_IN, or the same columns of any other moving element (absent: out of the beam).
 
     FLAG is added: 16 high cross-talk (a single exposure can hardly be inverted there), 32 beyond the field
     points of the calibration, 64 filter or temperature that the calibration has not seen. Beyond the field
@@ -109,6 +109,7 @@ def matrix(
     )
     result = MatrixTable(outcome.value, copy=False)
     result.meanings = {int(bit): bit.meaning for bit in Quality}
+    result.reading = instrument.reading_in_words
     crossed = outcome.content["flags"][str(int(Quality.HIGH_CROSSTALK))]
     text = f"{output}: {table.rows} rows, {crossed} of them in zones of high cross-talk"
     advice = (typed("matrix", "RUN", "--points", "TABLE", "-o", "OUT.fits"),) if output is None else ()

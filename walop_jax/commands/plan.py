@@ -124,7 +124,8 @@ def plan(
     `--separate RUN` plans what a diagnosis left undecided: one exposure, or two that differ, repeated for the time
     there is, for which the least expected Δχ² between any two members of the class is largest. Each pair is printed.
 
-    In Python: the plan. Raises ValueError for a time that pays for nothing or determines nothing.
+    In Python: an `ExposurePlan`, whose `observing_plan` is the plan for `simulate`. Raises ValueError for a time that
+    pays for nothing or determines nothing.
 
     >>> walop.plan(walop.ObservingPlan(grid=3), minutes=20.0)  # doctest: +SKIP
     """

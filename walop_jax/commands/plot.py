@@ -72,10 +72,10 @@ def plot(
 
     In Python: the matplotlib figure, of a run or of a fit, calibration, diagnosis, posterior, comparison, survey or set
     (`modulation`, at any number of points) in memory, written if `output` is given; without a name, a line about each
-    figure, by name. `figsize` (inches) is its size; with `ax` it
-    is drawn there (one of several panels in a subfigure that takes the room of these axes). `width` is that in print
-    (mm, "column" or "page"): panels are arranged for it. `reference` holds values by name that a corner plot marks.
-    Raises `DataError`, with the nearest names, for a figure that does not exist and for data that the run lacks.
+    figure, by name. `figsize` (inches) is its size; with `ax` it is drawn there (one of several panels in a subfigure
+    that takes the room of these axes). `width` is the width in print (mm, "column" or "page"), for which panels are
+    arranged. `reference` holds values by name that a corner plot marks. Raises `DataError`, with the nearest names, for
+    a figure that does not exist and for data that the run lacks.
 
     >>> walop.plot()["modulation"]
     'q_m and u_m against polariser angle'
@@ -114,7 +114,7 @@ def plot(
 
 
 def _inches(width: float | str | None) -> float | None:
-    """A width in inches."""
+    """The width in inches of a width in mm, or of "column" or "page"."""
     from walop_jax.reports.style import WIDTHS
 
     if width is None:

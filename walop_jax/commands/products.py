@@ -29,7 +29,7 @@ NOT_CARRIED_OVER = "not_carried_over"
 """Key under which results in JSON list the effects of a model that had to be left out."""
 
 Effects: TypeAlias = "PathLike | Sequence[EffectKind] | None"
-Fit: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
+FitLike: TypeAlias = "FitResult | Diagnosis | Run | PathLike"
 CalibrationLike: TypeAlias = "Calibration | FitResult | Diagnosis | Run | PathLike"
 Posterior: TypeAlias = "PosteriorSample | Any | PathLike | None"
 InstrumentLike: TypeAlias = "Instrument | PathLike | None"
@@ -53,7 +53,10 @@ def path_of(given: Any, what: str, advice: str) -> Path:
 
 
 def fit_of(given: Any) -> Any:
-    """The last fit of a diagnosis, whose calibration is that of the diagnosis; anything else as it is."""
+    """The last fit of a diagnosis; anything else as it is.
+
+    The calibration of that fit is the calibration of the diagnosis.
+    """
     after = getattr(given, "after", None)
     return after if isinstance(after, Fitted) else given
 

@@ -90,8 +90,10 @@ def refit(
     which hold what the pixels say of anything smooth. Structure that is finer is told, with its worst place. The
     calibration then holds a map of the residuals of the smooth model, as that of a set of more than 65536 points does.
 
-    In Python: the fit, whose `clipped` are the rows left out and whose `calset` has them flagged. Raises `DataError`
-    for data that cannot be trusted, ValueError for a model that does not fit.
+    In Python: a `FitResult`, with values and errors of all parameters (`result["pupil.magnification"]`,
+    `result.to_table()`), their covariance, residuals and the verdict (`result.trusted`, `result.warnings`). Nothing is
+    written unless `output` is given. `clipped` are the rows left out, and `calset` has them flagged. Raises `DataError`
+    for data that cannot be trusted, ValueError for a model that does not fit the data.
 
     >>> result = walop.refit(calset)  # doctest: +SKIP
     >>> result["pupil.magnification"]
@@ -106,7 +108,7 @@ def refit(
     from walop_jax.fit.misfit import describe
     from walop_jax.fit.outliers import clipped
     from walop_jax.fit.refit import refit as fit
-    from walop_jax.fit.refit import with_honest_errors
+    from walop_jax.fit.refit import with_empirical_covariance
     from walop_jax.science.field_accuracy import accuracy_of_fit, verdict_of_fit
 
     wanted = goal_of(goal) or GOAL
@@ -117,7 +119,7 @@ def refit(
             fitted = fit(calset, chosen, progress=say)
         else:
             say(Stage("fitting without outliers", "fitting"))
-            fitted = with_honest_errors(clipped(calset, chosen, clip))
+            fitted = with_empirical_covariance(clipped(calset, chosen, clip))
         say(Stage("looking for patterns in the residuals", "examining"))
         result = examined(fitted, job.seed)
         accuracy = accuracy_of_fit(result, wanted)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, UsageError, command, write_text
 from walop_jax.commands.inputs import goal_of, save
-from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import Effects, FitLike, catalogue_of, fit_of, folder_of
 from walop_jax.io.atomic import check_output
 from walop_jax.io.text import encodable
 
@@ -31,7 +31,7 @@ OPTIONS = {
 @command(stages=("reading", "drawing"), writes=(), options=OPTIONS)
 def report(
     job: Job,
-    run: Fit,
+    run: FitLike,
     output: PathLike | None = None,
     *,
     data: Sequence[PathLike] | None = None,

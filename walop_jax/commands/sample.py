@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from walop_jax.commands.command import Job, Option, Outcome, PathLike, command, typed
 from walop_jax.commands.inputs import ModelLike
-from walop_jax.commands.products import Effects, Fit, catalogue_of, fit_of, folder_of
+from walop_jax.commands.products import Effects, FitLike, catalogue_of, fit_of, folder_of
 from walop_jax.io.errors import fail
 from walop_jax.io.folder import output_folder
 from walop_jax.io.names import PRODUCT, SAMPLE
@@ -44,7 +44,7 @@ OPTIONS = {
 @command(writes=(), random=True, options=OPTIONS)
 def sample(
     job: Job,
-    fit: Fit,
+    fit: FitLike,
     *,
     resume: bool = False,
     model: ModelLike = None,

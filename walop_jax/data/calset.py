@@ -46,10 +46,10 @@ _COMPRESSED = "COMPRESSION"  # extension of sets that stood for the pixels of fr
 def read_calibration_set(
     *paths: PathLike, kinds: Collection[str] = (), cells: int | None = None
 ) -> CalibrationSet:
-    """Read and check one calibration set, merging several files into one.
+    """Read and check one calibration set; several files become one set.
 
-    Whole frames become field points, the means of `cells` of their pixels along the longer side (default: 80). Oddities
-    that are harmless (unknown columns, masked rows, …) stand in `remarks`. `kinds` are kinds of exposures beyond
+    Whole frames become field points, means over cells of their pixels: `cells` along the longer side (default: 80).
+    Harmless oddities (unknown columns, masked rows, …) are listed in `remarks`. `kinds` are KINDs of exposures beyond
     `KINDS`, for sources of the caller's own.
 
     Raises `DataError` that names file, extension, column and row for anything that cannot be trusted.
@@ -138,13 +138,14 @@ def assembled(
     fine: FineStructure | None = None,
     stated_errors: StatedErrors | None = None,
 ) -> CalibrationSet:
-    """A checked calibration set from its tables, columns by name in kind and unit of the schema.
+    """A checked calibration set from its tables, each a dictionary of columns in kind and unit of the schema.
 
-    FILTERS and SOURCES may be missing; with `images` (HDUs of whole frames by name) POINTS and INTENSITIES are not
-    used: they are made of `cells` of the frames. `structure` is the HDU of what is finer than the points of a set that
-    was made of frames, `fine` the same from memory. `path` is what errors and remarks call the set.
+    FILTERS and SOURCES may be missing. With `images` (HDUs of whole frames by name) POINTS and INTENSITIES are made of
+    `cells` of the frames, and tables of that name are not used. `structure` is the HDU with the structure that is finer
+    than the points of a set made of frames, `fine` the same from memory. `path` is the name of the set in errors and
+    remarks.
 
-    Raises `DataError` for whatever numbers cannot be meant.
+    Raises `DataError` for numbers that cannot be meant.
     """
     remarks = list(remarks)
     instrument = checks.instrument_name(instrument, Place(path, "PRIMARY"))
@@ -170,7 +171,7 @@ def assembled(
         remarks += odd + repeated
         rows = intensities.exposure
         numbers = intensities.counts, intensities.sigma, intensities.used
-        # Of many pixels each, with the errors of their mean, are the rows of a set that was made of frames.
+        # Rows of a set made of frames stand for many pixels each, with the errors of their means.
         photons = ~exposures.flux_known[rows] & (structure is None and fine is None)
         doubts = plausible.of_counts(*numbers, measured=photons, group=rows)
         remarks += [place.remark(what, column) for column, what in doubts]
@@ -356,8 +357,8 @@ def from_arrays(
     """A checked calibration set from arrays in memory.
 
     `counts` and `errors` have the shape (point, exposure, camera), in electrons; counts that are NaN in all cameras
-    were not measured. `x`, `y` are the field points in degrees, `angles` those of the calibration polariser in every
-    exposure in degrees, NaN where it is out. `kinds` is the KIND of every exposure, or one for all.
+    were not measured. `x`, `y` are the field points in degrees, `angles` the angles (deg) of the calibration polariser
+    in the exposures, NaN where it is out. `kinds` is the KIND of every exposure, or one for all.
 
     Any other column of EXPOSURES goes by its name in small letters, one value or one for each exposure: `mjd`,
     `filter`, `teff`, `temp`, `ha`, `ra`, `dec`, `rotator`, `chwp_in`, `chwp_angle`, … (docs: files). `sources` are the
@@ -423,7 +424,7 @@ def from_arrays(
 
 
 def checked(calset: CalibrationSet, kinds: Collection[str] = ()) -> CalibrationSet:
-    """A set from memory behind the checks that files meet; unusable rows are masked, and remarked on."""
+    """A set from memory after the checks that files go through; unusable rows are masked, with a remark."""
     names = "instrument", "site", "origin", "fine", "stated_errors"
     header = {name: getattr(calset, name) for name in names}
     found = _in_memory(set_tables(calset), **header, kinds=(*KINDS, *kinds))
@@ -444,7 +445,7 @@ def _in_memory(tables: Mapping[str, Mapping[str, Any]], **header: Any) -> Calibr
 
 
 def _spoilt(counts: np.ndarray) -> Iterator[str]:
-    """Remark on values that are finite in some cameras only, by their place in the array."""
+    """Remarks on values that are finite in some cameras only, by their position in the array."""
     finite = np.isfinite(counts)
     places = np.argwhere(finite.any(axis=2) & ~finite.all(axis=2))
     if len(places):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from walop_jax.data import plausible
 from walop_jax.data.camera_headers import (
@@ -44,15 +44,14 @@ from walop_jax.data.user_tables import (
     sky_positions,
 )
 from walop_jax.io.errors import PathLike, errors_naming, rows_text
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import parse_toml, read_text, some
 from walop_jax.io.toml import Reader
-
-Numbers = Float[np.ndarray, " n"]
 
 SHIPPED = ("sextractor", "photutils")
 BAD_PIXEL = int(DataFlag.BAD_PIXEL)
 _OF_IMAGE = "_SKY"
-"""End of columns in the reference system of the image; others are in that of the table."""
+"""End of the names of columns in the reference system of the image; other columns are in the system of the table."""
 _FAINTEST_MAGNITUDE = 40.0
 _NEGATIVE = 5.0  # standard errors
 _UNITS: Mapping[str, str] = {
@@ -61,7 +60,7 @@ _UNITS: Mapping[str, str] = {
 }  # fmt: skip
 """Units of fluxes by their names in catalogues."""
 _OF_A_PIXEL = re.compile(r"\s*/\s*pix(els?)?$")
-"""End of the unit of a level of the sky that is stated in a pixel: it is that of a level."""
+"""End of the unit of a level of the sky that is stated for a pixel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,21 +88,21 @@ class ColumnMap:
 
 @dataclasses.dataclass(frozen=True)
 class CameraCatalogue:
-    """The stars of one camera: positions (deg), fluxes with errors (electrons), level of the sky, and bits of FLAG.
+    """The stars of one camera (n): positions (deg), fluxes with errors (electrons), level of the sky, and bits of FLAG.
 
     `flux_name` is the column of the fluxes; `sky` is None where no level is stated. `blended` marks stars whose flags
-    only say that another one is near. `of_stars` are columns that go with the stars, `of_exposure` the values that all
-    of them share; `instrument` is INSTRUME as stated ("": not at all), `worded` what the words of an observatory make
-    of the headers. Fluxes that were not measured are NaN.
+    only say that another star is near. `of_stars` are columns that belong to the stars, `of_exposure` values that all
+    of them have in common; `instrument` is INSTRUME as stated ("": not stated), `worded` what the words of an
+    observatory make of the headers. Fluxes that were not measured are NaN.
     """
 
     path: Path
-    ra: Numbers
-    dec: Numbers
-    flux: Numbers
-    error: Numbers
+    ra: Vector
+    dec: Vector
+    flux: Vector
+    error: Vector
     flux_name: str
-    sky: Numbers | None
+    sky: Vector | None
     flag: Int[np.ndarray, " n"]
     blended: Bool[np.ndarray, " n"]
     of_stars: Mapping[str, np.ndarray]
@@ -149,14 +148,14 @@ def read_camera_catalogue(
     *,
     drop_blends: bool = False,
 ) -> CameraCatalogue:
-    """The catalogue of a camera, by a map of columns (None: the one of those that come with the package that fits).
+    """The catalogue of a camera, read by a map of columns (None: the map of the package that fits).
 
-    `words` of its headers are columns about the exposure and its pointing, in place of those named so. Stars that are
-    flagged only as having another one near are kept unless `drop_blends`, with a remark; those without a position are
-    left out, with a remark.
+    `words` of its headers are columns about the exposure and its pointing, in place of header words with the names of
+    these columns. Stars that are flagged only as having a neighbour are kept unless `drop_blends`, with a remark; stars
+    without a position are left out, with a remark.
 
-    `gain` is in electrons per count (None: that of the column's unit, else 1, with a remark). Fluxes are in electrons
-    then.
+    `gain` is in electrons per count (None: from the unit of the column, else 1, with a remark). Fluxes come back in
+    electrons.
 
     Raises `DataError` for a file without fluxes, for magnitudes in their place, for flags whose bits the map does not
     know, and where there is neither a position on the sky nor a WCS.
@@ -274,8 +273,10 @@ def _no_flux(source: InputTable, maps: Sequence[ColumnMap], place: Place) -> Exc
 
 def _fluxes(
     source: InputTable, column_map: ColumnMap, gain: float | None, place: Place
-) -> tuple[Numbers, ...]:
-    """Fluxes, errors and the level of the sky, if there is one (electrons); without a unit they have the flux's."""
+) -> tuple[Vector, ...]:
+    """Fluxes, errors and the level of the sky, if there is one (electrons); a level without a unit has the unit of the
+    flux.
+    """
     pair = _pair(source, column_map.flux)
     unused = [other[0] for other in column_map.flux if other != pair and other[0].upper() in source.names]
     names = [*pair, *[name for name in column_map.level if name.upper() in source.names][:1]]
@@ -312,7 +313,7 @@ def _fluxes(
     return tuple(factor * values for values in (flux, error, *sky))
 
 
-def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
+def _plain_numbers(source: InputTable, name: str, place: Place) -> Vector:
     """A column without its unit."""
     unitless = in_memory({name: np.ma.asarray(_one(source, name, place))}, str(source.path))
     return numeric_column(unitless, name.upper(), Column("float", missing=np.nan))
@@ -320,7 +321,7 @@ def _plain_numbers(source: InputTable, name: str, place: Place) -> Numbers:
 
 def _positions(
     source: InputTable, column_map: ColumnMap, headers: Headers, mjd: float, place: Place
-) -> tuple[Numbers, Numbers]:
+) -> tuple[Vector, Vector]:
     """Right ascension and declination (deg, ICRS), NaN where they are not known.
 
     From the sky, in the reference system of the columns or of the header, or from pixels by the WCS of the header.

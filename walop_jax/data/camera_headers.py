@@ -1,6 +1,7 @@
-"""The headers of the catalogue of a camera: of its image, of its table, and the primary header of its file.
+"""The headers of a catalogue of a camera: of its image, of its table, and the primary header of its file.
 
-The nearest to the stars counts, in this order; a later one that says something else is an error, which names both.
+The header nearest to the stars counts, in this order. A later header that says something else is an error, which names
+both.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Headers:
         return [(where, value) for where, value in found if _is_stated(value)]
 
     def value(self, name: str) -> Any:
-        """The value of a word in the header that is nearest to the stars; None: none states it.
+        """The value of a word in the header nearest to the stars; None if no header states it.
 
         Raises `DataError` where another header contradicts it.
         """
@@ -62,7 +63,10 @@ class Headers:
         return next((header for _, header in self.parts if "CRVAL1" in header), {})
 
     def frame(self, of_image: bool, mjd: float = math.nan) -> Frame:
-        """The reference system of directions: of the first header that states one; `of_image` counts that as well."""
+        """The reference system of directions, from the first header that states one.
+
+        The header of the image counts only if `of_image`.
+        """
         for where, header in self.parts:
             frame = frame_of(header, Place(self.path, "header"), mjd)
             if frame != ICRS and (of_image or where != IMAGE):
@@ -80,7 +84,7 @@ class Headers:
 
 
 def read_headers(path: Path, of_table: Mapping[str, Any]) -> Headers:
-    """The headers of a file, of which `of_table` is that of its table. Raises `DataError` for damaged FITS files."""
+    """The headers of a file; `of_table` is the header of its table. Raises `DataError` for damaged FITS files."""
     parts: list[tuple[str, Any]] = [(TABLE, {str(key).upper(): value for key, value in of_table.items()})]
     file = Path(str(path).partition("[")[0]) if not path.exists() else path
     try:

@@ -7,9 +7,9 @@ Surface     Frames are cut into blocks. To the pixels of a block a surface is fi
             independent errors, σ/√(w n) each with w n the pixels that the point stands for, its cell; and the next
             polynomial, the largest of those left out, is zero there. A mean over a cell, taken for the value at its
             middle, is off by side²/24 · ∇²; these values by the eighth power of the side of a block.
-Light       Fitted are shares N_k/L of the light L = Σ_k N_k of a pixel, and N_k = share · (surface of L) at the points:
-            what the cameras have in common, such as the illumination of the field, may be as rough as it likes. Of
-            photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
+Light       Fitted are fractions N_k/L of the light L = Σ_k N_k of a pixel, and N_k = fraction · (surface of L) at the
+            points: what the cameras have in common, such as the illumination of the field, may be as rough as it likes.
+            Of photons N_k/L is no biased estimate (given L, N_k are multinomial). Where the flux is known, shared or
             faint, L = 1, and the surface is that of the counts themselves.
 Weights     N_ERR of the pixels is made from their counts: weights 1/σ² would favour pixels that happen to be faint. All
             have the same weight, in all cameras, so that errors are Σσ² of all, propagated.
@@ -17,8 +17,8 @@ Bad pixels  A pixel that is bad in one camera is left out of that exposure. Surf
             the errors that follow. A block without the pixels that its surface needs, at the edge of a round field,
             keeps one point for each part with pixels, at their mean position, and a surface that these can hold.
 Structure   Residuals r of a pixel about the surfaces that agree between exposures: with q = L s(1 − s), the change of
-            counts by a gain of one camera (share s), Σ_{e≠e'} r_e r_e' = g² Σ_{e≠e'} q_e q_e' over exposures e,
-            whatever the noise is, as long as it is independent. See `FineStructure`. Pixels of single spots, which
+            counts by a gain of one camera with the fraction s, Σ_{e≠e'} r_e r_e' = g² Σ_{e≠e'} q_e q_e' over exposures
+            e, whatever the noise is, as long as it is independent. See `FineStructure`. Pixels of single spots, which
             no surface holds, are left out of all exposures.
 Sources     Golub & Welsch 1969, Mathematics of Computation 23, 221 (zeros as eigenvalues); Szegő 1939, Orthogonal
             Polynomials, §3.4 (independence of values at zeros).
@@ -41,35 +41,34 @@ from walop_jax.data.frames import Frames
 from walop_jax.data.records import Block, FineStructure, Points
 from walop_jax.data.table_intensities import SPOILT, TableIntensities, usable
 from walop_jax.data.units import Place
+from walop_jax.io.shapes import Vector
 
 CELLS = 80
-"""Cells along the longer side of frames, unless the user says otherwise: parameters are within 0.05 standard errors of
-those of a fit to all pixels."""
+"""Cells along the longer side of frames, unless the user says otherwise: parameters then lie within 0.05 standard
+errors of a fit to all pixels."""
 ORDER = 4
 """Points along a side of a block."""
 BRIGHT = 20.0
-"""Standard errors of the light of a pixel, or of a cell, above which shares of it are taken."""
+"""Standard errors of the light of a pixel, or of a cell, above which fractions of it are taken."""
 MAP = 16
 """Parts of a block, along a side, in which structure is measured."""
 
 _TOGETHER = 1 << 15  # pixels of a camera: their numbers stay in the cache of a processor
 _HUGE = 10.0  # times the median error in its block row: a mark of a bad pixel, and no error
 _WHOLE = 0.2  # smallest eigenvalue of the normal matrix, 1 with all pixels, of a block with all of its points
-_SOUND = 0.05  # the same, for its share of pixels, of a surface that parts of a block hold
+_SOUND = 0.05  # the same, for its fraction of pixels, of a surface that parts of a block hold
 _FEW = 0.05  # of the patches of a row of blocks: with more of them spots are no spots, and stay
 _ALIKE = 0.1  # of the best exposure of a block: exposures that have less of it are left out there
 _PART = 0.1  # of the pixels of the fullest part of a block: parts that have less get no point
-
-Vector = Float[np.ndarray, " n"]
 
 
 def orthonormal(
     places: Vector, order: int, weight: Vector | None = None
 ) -> tuple[Float[np.ndarray, " o"], Float[np.ndarray, "o o"]]:
-    """The polynomials of degrees 0 to `order` − 1 that are orthonormal over places between −1 and 1.
+    """The polynomials of degrees 0 to `order` − 1 that are orthonormal over some places between −1 and 1.
 
-    `weight` is that of each place; None: 1. Returns the zeros of the next polynomial, and the matrix that makes the
-    polynomials of Legendre's: `legvander(x, order - 1) @ matrix`.
+    `weight` is the weight of each place; None: all have weight 1. Returns the zeros of the next polynomial, and the
+    matrix that makes these polynomials from Legendre's: `legvander(x, order - 1) @ matrix`.
     """
     plain = legvander(places, order - 1)
     values, triangle = np.linalg.qr(plain if weight is None else np.sqrt(weight)[:, None] * plain)
@@ -223,7 +222,7 @@ class _Binning:
                 self.tally.spots += int(spots.sum())
             found += points
             structure.append(patches)
-        remarks = self._judged()
+        remarks = self._checked_pixels()
         column, row, *data = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
         x, y = self.frames.grid.at(column, row)
         points = Points(np.arange(len(x), dtype=np.int32), x, y)
@@ -300,7 +299,7 @@ class _Binning:
         sigma: Float[np.ndarray, "k y x"],
         used: Bool[np.ndarray, "y x"],
     ) -> Float[np.ndarray, "y x"]:
-        """The light of every used pixel: the sum of its cameras, or 1 in blocks where shares of that say nothing."""
+        """The light of every used pixel: the sum of its cameras, or 1 in blocks where fractions of that say nothing."""
         if self.known[exposure] or self.single:
             return np.ones(used.shape)
         total = np.where(used, counts.sum(axis=0, dtype=float), 0.0)
@@ -421,7 +420,7 @@ class _Binning:
             least = np.linalg.eigvalsh(normal[:, terms[:, None], terms])[:, 0]
             if len(terms) <= parts and least.max() >= _SOUND * normal[:, 0, 0].max():
                 return terms, least
-        # The first polynomial is constant: its term is the share of the pixels that are used.
+        # The first polynomial is constant: its term is the fraction of the pixels that are used.
         return index[0, :1], normal[:, 0, 0]
 
     # --------------------------------------------------------------------------------------------------- structure
@@ -493,7 +492,7 @@ class _Binning:
 
     # ----------------------------------------------------------------------------------------------------- verdict
 
-    def _judged(self) -> list[str]:
+    def _checked_pixels(self) -> list[str]:
         """Refuse frames that cannot be measurements; remarks on pixels that are not used."""
         tally, last = self.tally, self.frames.cameras - 1
         place, images = Place(self.path, "N0"), f"N0…N{last}, E0…E{last}"

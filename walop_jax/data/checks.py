@@ -1,4 +1,4 @@
-"""Checks of the numbers of a calibration set, before anyone believes them."""
+"""Plausibility checks of the numbers in a calibration set."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ COLUMNS = ("EXPOSURE", "POINT", "X", "Y", "KIND", "CAMERA", "DISTANCE")
 class Clipped:
     """Intensities that lie far from a fit of all others, and took no part in it.
 
-    Row r is that of EXPOSURE `exposure[r]` and POINT `point[r]` of the set. Its camera number `camera[r]` lies
-    `distance[r]` standard errors from the fit; `sigma` is the distance from which on rows are left out. `used` rows
-    took part before.
+    Entry r is the intensity of EXPOSURE `exposure[r]` at POINT `point[r]` of the set, in the camera with the number
+    `camera[r]`: it lies `distance[r]` standard errors from the fit. `sigma` is the distance from which on intensities
+    are left out. `used` rows took part before.
     """
 
     sigma: float

@@ -1,4 +1,4 @@
-"""Images of whole frames in a file: where their rows lie, and their reader. What becomes of them: `cells`."""
+"""Images of whole frames in a file: where their rows lie, and how they are read; `cells` makes field points of them."""
 
 from __future__ import annotations
 

@@ -47,11 +47,11 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Word:
-    """Origin of a column: the first of the words in `word` that is there, or a fixed `value`.
+    """How one column of EXPOSURES is made: from the first of the words in `word` that is there, or a fixed `value`.
 
-    `values` replace those of the word (names of filters, kinds, positions), `unit` is that of the word, `expression`
-    makes the value of the column of x, the value in the unit of the column, and of other columns, as they are in the
-    end, by name.
+    `values` replaces values of the word (names of filters, kinds, positions); `unit` is the unit of the word.
+    `expression` makes the value of the column from x, the value of the word in the unit of the column, and from the
+    final values of other columns, by name. Example: `word = ["ROTANGLE"]`, `expression = "360 - x"`.
     """
 
     word: tuple[str, ...] = ()
@@ -66,8 +66,8 @@ class Word:
 class Words:
     """The words of an observatory by column of EXPOSURES, and the other entries of its file.
 
-    These are the extension of FITS files, where the `rows` of a JSON file are, numbers of filters and facts of
-    schedules (`data.schedule`).
+    `extension` is the extension of FITS files with the words, `rows` says where the rows of a JSON file are, `filters`
+    gives the numbers of filters and `schedule` the facts of schedules (`data.schedule`).
     """
 
     columns: Mapping[str, Word]

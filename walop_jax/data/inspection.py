@@ -23,7 +23,7 @@ from walop_jax.io.text import rounded
 
 Severity = Literal["fault", "doubt", "note"]
 
-_LOOKED_AT = 1024  # field points whose intensities are looked at; in evenly spaced runs
+_LOOKED_AT = 1024  # field points whose intensities are looked at; in evenly spaced blocks
 FEW_ANGLES = 8
 """Angles of the polariser modulo 180° below which a set is in doubt."""
 _FEWEST_SETTINGS = 3
@@ -36,7 +36,9 @@ _MUCH = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something about a set that its owner should know: a fault forbids a fit, a doubt may spoil it."""
+    """Something about a set that its owner should know: a fault forbids a fit, a doubt may spoil it, a note does
+    neither.
+    """
 
     severity: Severity
     what: str
@@ -48,9 +50,10 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Exposures that share kind, filter, calibration plate (text) and colour temperature (text).
+    """Exposures with the same kind, filter, position of the calibration plate (text) and colour temperature (text).
 
-    `teff` is "star" for standards, which have their own; `used` is the share of the points with used data.
+    `teff` is "star" for standards, each of which has its own; `used` is the fraction of the field points with used
+    data.
     """
 
     kind: str
@@ -144,7 +147,9 @@ class Inspection(Displayed):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class InspectedSets(Displayed):
-    """An inspection of every file, or the error that it gave; one of all as one set; faults in words."""
+    """The inspection of every file, or the error that reading it gave; the inspection of all as one set; faults in
+    words.
+    """
 
     sets: tuple[tuple[str, Inspection | DataError], ...]
     joint: Inspection | None
@@ -158,12 +163,12 @@ class InspectedSets(Displayed):
 
     @property
     def inspections(self) -> tuple[Inspection, ...]:
-        """Those that could be made, that of all sets together the last."""
+        """The inspections that could be made, the inspection of all sets together last."""
         readable = [inspection for _, inspection in self.sets if not isinstance(inspection, DataError)]
         return (*readable, *(() if self.joint is None else (self.joint,)))
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The inspections as plain data, for `--json`."""
         sets = [
             {"files": [path], "error": str(of)} if isinstance(of, DataError) else dataclasses.asdict(of)
             for path, of in self.sets
@@ -258,7 +263,7 @@ def _widest_gap(angles: np.ndarray, turn: float) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    """The median of the finite ones, NaN of none."""
+    """The median of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")
 

@@ -7,8 +7,8 @@ Surface     The field is cut into rectangles. To the cells of a rectangle a poly
             is fitted for each exposure and camera, and kept as its values at q × q points: the zeros of the polynomials
             of degree q that are orthogonal over the cells, weighted by what these know. As in `cells` values there have
             independent errors, and the next polynomial, left out, is zero there.
-Light       Fitted are shares of the light of a cell, where fluxes are free, and their product with the surface of the
-            light is kept (`cells`).
+Light       Fitted are fractions of the light of a cell, where fluxes are free, and their product with the surface of
+            the light is kept (`cells`).
 Weights     w of a cell is the mean of L²/σ² over exposures and cameras, alike for all of them, as a product of one
             number for each column and one for each row. Errors are those of σ, propagated.
 Gaps        Cells that an exposure lacks are left out of its fit. A rectangle whose cells are no raster, at the edge of
@@ -31,6 +31,7 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.cells import BRIGHT, orthonormal
 from walop_jax.data.records import Block, CalibrationSet, Points
 from walop_jax.data.table_intensities import ONE_CAMERA, TableIntensities
+from walop_jax.io.shapes import Vector
 
 ORDER, OF_LARGE = 5, 7
 """Points along a side of a rectangle, at least, and those of rectangles larger than a quarter of the field. Fewer would
@@ -44,8 +45,7 @@ _ALIKE = 0.5  # of the exposures of a cell: with fewer in common it is no cell o
 _SAME = 1e-6  # of a side: cells nearer than that lie in the same column, or row
 _HELD = 0.2  # smallest eigenvalue of the normal matrix, 1 with all cells, of an exposure that has gaps
 
-Vector = Float[np.ndarray, " n"]
-Chosen = Int[np.ndarray, " c"]
+CellIndex = Int[np.ndarray, " c"]
 
 
 def joined_cells(calset: CalibrationSet, most: int) -> CalibrationSet:
@@ -73,17 +73,17 @@ def joined_cells(calset: CalibrationSet, most: int) -> CalibrationSet:
 class _Rectangle(NamedTuple):
     """Cells (numbers of points of the set), row by row of their raster; its columns `x` and rows `y`; `order`: q."""
 
-    cells: Chosen
+    cells: CellIndex
     x: Vector
     y: Vector
     order: tuple[int, int]
 
 
-def _some(block: Block, chosen: Chosen) -> Block:
+def _some(block: Block, chosen: CellIndex) -> Block:
     return Block(**{f.name: getattr(block, f.name)[chosen] for f in dataclasses.fields(Block)})
 
 
-def _rasters(block: Block) -> Iterator[Chosen]:
+def _rasters(block: Block) -> Iterator[CellIndex]:
     """Cells that have the same exposures, but for gaps."""
     cells = np.flatnonzero((block.source < 0).all(axis=1) & block.used.any(axis=1))
     used = block.used[cells]
@@ -98,7 +98,7 @@ def _rasters(block: Block) -> Iterator[Chosen]:
         yield cells[nearest == number]
 
 
-def _cut(block: Block, cells: Chosen, most: float) -> Iterator[_Rectangle]:
+def _cut(block: Block, cells: CellIndex, most: float) -> Iterator[_Rectangle]:
     """Rectangles of cells that become about `most` field points together."""
     place = np.stack([block.x[cells], block.y[cells]], axis=1)
     low, size = place.min(axis=0), np.ptp(place, axis=0)
@@ -114,7 +114,7 @@ def _cut(block: Block, cells: Chosen, most: float) -> Iterator[_Rectangle]:
 
 
 def _rectangles(
-    block: Block, cells: Chosen, middle: Vector, size: Vector, order: Int[np.ndarray, " 2"]
+    block: Block, cells: CellIndex, middle: Vector, size: Vector, order: Int[np.ndarray, " 2"]
 ) -> Iterator[_Rectangle]:
     """The cells of a rectangle, or those of its quarters where they are no raster."""
     sides = []

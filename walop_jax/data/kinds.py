@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 
 class ExposureKind(NamedTuple):
-    """Facts about a KIND of exposures.
+    """What all exposures of one KIND have in common.
 
-    `flux_known`: its flux is one, `flux_shared`: an unknown one is the same in all exposures of a filter, `from_sky`:
-    the light comes through the telescope. `seconds` is the usual exposure time, None where no plan observes it.
+    `flux_known`: the flux is one. `flux_shared`: an unknown flux is the same in all exposures of a filter. `from_sky`:
+    the light comes through the telescope. `seconds` is the usual exposure time, None for a KIND that no plan observes.
+    The KIND `moon`, for instance, has an unknown flux and comes from the sky.
     """
 
     flux_known: bool = False

@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from walop_jax.io.errors import rows_text
+from walop_jax.io.shapes import CountsOfRows, Vector
 
-Numbers = Float[np.ndarray, " n"]
-Counts = Float[np.ndarray, "n k"]
-Used = Bool[np.ndarray, " n"]
+UsedRows = Bool[np.ndarray, " n"]
 Groups = Int[np.ndarray, " n"]
 
 OLDEST = 48000.0
@@ -43,14 +42,14 @@ _NEGATIVE = 5.0  # standard errors
 
 
 class Implausible(NamedTuple):
-    """A sentence about a column."""
+    """A sentence that doubts the values of one column."""
 
     column: str
     what: str
 
 
 def today() -> float:
-    """The MJD of now."""
+    """The present moment as MJD (UTC)."""
     return time.time() / 86400.0 + 40587.0
 
 
@@ -70,7 +69,7 @@ def of_columns(columns: Mapping[str, np.ndarray], now: float = np.inf) -> Iterat
         )
 
 
-def of_times(mjd: Numbers, now: float = np.inf) -> Iterator[Implausible]:
+def of_times(mjd: Vector, now: float = np.inf) -> Iterator[Implausible]:
     """Doubts about dates (MJD, d): before 1990, in the future, of a clock that was not set."""
     known = np.isfinite(mjd)
     zero = known & np.isin(mjd, list(_ZEROS))
@@ -92,7 +91,7 @@ def of_times(mjd: Numbers, now: float = np.inf) -> Iterator[Implausible]:
         )
 
 
-def of_campaign(mjd: Numbers) -> Iterator[Implausible]:
+def of_campaign(mjd: Vector) -> Iterator[Implausible]:
     """Doubts about exposures of one set that are years apart."""
     if not np.isfinite(mjd).any():
         return
@@ -102,7 +101,7 @@ def of_campaign(mjd: Numbers) -> Iterator[Implausible]:
         yield Implausible("MJD", f"{what}; correct it, or calibrate the epochs one by one")
 
 
-def of_exposure_times(exptime: Numbers, mjd: Float[np.ndarray, " m"]) -> Iterator[Implausible]:
+def of_exposure_times(exptime: Vector, mjd: Float[np.ndarray, " m"]) -> Iterator[Implausible]:
     """Doubts about exposure times (s): milliseconds, by their length or by the dates (MJD, d) of the exposures."""
     known = np.isfinite(exptime)
     if not known.any():
@@ -126,7 +125,7 @@ def of_exposure_times(exptime: Numbers, mjd: Float[np.ndarray, " m"]) -> Iterato
         yield Implausible("EXPTIME", f"{what}: are these milliseconds? Seconds are wanted")
 
 
-def of_temperatures(celsius: Numbers) -> Iterator[Implausible]:
+def of_temperatures(celsius: Vector) -> Iterator[Implausible]:
     """Doubts about temperatures: of no instrument, or far from those of the other exposures."""
     known = np.isfinite(celsius)
     if not known.any():
@@ -145,7 +144,7 @@ def of_temperatures(celsius: Numbers) -> Iterator[Implausible]:
         )
 
 
-def of_angles(name: str, degrees: Numbers, *, radians: bool = True) -> Iterator[Implausible]:
+def of_angles(name: str, degrees: Vector, *, radians: bool = True) -> Iterator[Implausible]:
     """Doubts about angles: beyond a turn, or `radians`."""
     known = np.isfinite(degrees)
     if np.any(beyond := known & (np.abs(degrees) > 360.0)):
@@ -173,11 +172,11 @@ def like_radians(angles: np.ndarray) -> bool:
 
 
 def of_counts(
-    counts: Counts,
-    sigma: Counts,
-    used: Used,
+    counts: CountsOfRows,
+    sigma: CountsOfRows,
+    used: UsedRows,
     *,
-    measured: Used | None = None,
+    measured: UsedRows | None = None,
     group: Groups | None = None,
     cameras: Sequence[str] = (),
 ) -> Iterator[Implausible]:
@@ -191,7 +190,7 @@ def of_counts(
     yield from of_wraps(counts, sigma, group, cameras)
 
 
-def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Implausible]:
+def of_errors(counts: CountsOfRows, sigma: CountsOfRows, used: UsedRows) -> Iterator[Implausible]:
     """Doubts about standard errors, by those of photons √N in the brightest tenth, where the sky matters least."""
     good = used[:, None] & np.isfinite(counts) & np.isfinite(sigma) & (counts > 0) & (sigma > 0)
     if good.sum() < _FEWEST_FULL:
@@ -214,7 +213,7 @@ def of_errors(counts: Counts, sigma: Counts, used: Used) -> Iterator[Implausible
         yield Implausible("N_ERR", f"is {np.sqrt(ratio):.3g} times the noise of photons √N (median): {cause}")
 
 
-def of_ceilings(counts: Counts, used: Used, cameras: Sequence[str] = ()) -> Iterator[Implausible]:
+def of_ceilings(counts: CountsOfRows, used: UsedRows, cameras: Sequence[str] = ()) -> Iterator[Implausible]:
     """Doubts about values that are exactly the largest of their camera in several rows: a detector that is full."""
     for camera in range(counts.shape[1]):
         values = np.where(used & np.isfinite(counts[:, camera]), counts[:, camera], -np.inf)
@@ -228,7 +227,7 @@ def of_ceilings(counts: Counts, used: Used, cameras: Sequence[str] = ()) -> Iter
 
 
 def of_wraps(
-    counts: Counts, sigma: Counts, group: Groups | None = None, cameras: Sequence[str] = ()
+    counts: CountsOfRows, sigma: CountsOfRows, group: Groups | None = None, cameras: Sequence[str] = ()
 ) -> Iterator[Implausible]:
     """Doubts about values that would be like others with 65536 more: of a counter of 16 bits that began anew.
 

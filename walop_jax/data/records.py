@@ -18,10 +18,10 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import nearest
 from walop_jax.io.plain_tables import astropy_table
 
-RUN = 64  # field points that are sampled together
+SAMPLED_TOGETHER = 64  # neighbouring field points that a sample takes together
 SPOT = 8.0  # standard errors from which a patch of the field holds structure of its own
 ROUNDING = 1e-10  # mean square gain of the rounding of numbers without noise
-FINE = 4.0  # standard errors from which the whole field holds some
+FINE = 4.0  # standard errors from which the whole field holds structure
 
 
 class DataFlag(enum.IntFlag):
@@ -55,7 +55,9 @@ class Site:
 
 
 class ErrorWord(NamedTuple):
-    """One number of `StatedErrors`: its word in a primary header, its unit, its usual size, what it is the error of."""
+    """One number of `StatedErrors`: its word in a primary header, its unit, its usual size, and what it is the error
+    of.
+    """
 
     word: str
     unit: str
@@ -65,27 +67,27 @@ class ErrorWord(NamedTuple):
 
 ERROR_WORDS: Mapping[str, ErrorWord] = {
     "position": ErrorWord("POS_ERR", "arcsec", 1.0, "X and of Y, common to all field points"),
-    "scale": ErrorWord("SCAL_ERR", "", 1e-3, "the scale of X and Y, a share"),
+    "scale": ErrorWord("SCAL_ERR", "", 1e-3, "the scale of X and Y, a fraction"),
     "turn": ErrorWord("TURN_ERR", "rad", 1e-3, "the angle by which the field is turned"),
     "wavelength": ErrorWord(
         "WAVE_ERR", "um", 3e-3, "the wavelengths of a filter curve, common to all of them"
     ),
-    "teff": ErrorWord("TEFF_ERR", "", 0.05, "TEFF, a share, common to all exposures of a KIND"),
+    "teff": ErrorWord("TEFF_ERR", "", 0.05, "TEFF, a fraction, common to all exposures of a KIND"),
     "pointing": ErrorWord("RA_ERR", "arcsec", 60.0, "RA and of DEC of sky exposures, common to all of them"),
     "time": ErrorWord("MJD_ERR", "s", 1.0, "MJD of sky exposures, common to all of them"),
     "site": ErrorWord("SITE_ERR", "deg", 0.01, "SITELAT and of SITELONG"),
     "rotator": ErrorWord("ROT_ERR", "deg", 0.1, "ROTATOR, common to all exposures of a KIND"),
-    "sky": ErrorWord("SKY_ERR", "", 0.02, "SKY, a share, common to all intensities"),
+    "sky": ErrorWord("SKY_ERR", "", 0.02, "SKY, a fraction, common to all intensities"),
     "linearity": ErrorWord(
-        "LIN_ERR", "", 0.02, "N of one camera, a share at 10⁶ electrons that grows with N"
+        "LIN_ERR", "", 0.02, "N of one camera, a fraction at 10⁶ electrons that grows with N"
     ),
     "scattered": ErrorWord(
-        "SCAT_ERR", "", 3e-3, "N of one camera, a share of its median counts in every exposure"
+        "SCAT_ERR", "", 3e-3, "N of one camera, a fraction of its median counts in every exposure"
     ),
     "pedestal": ErrorWord(
-        "BIAS_ERR", "", 3e-3, "N of one camera, a share of the usual counts, the same everywhere"
+        "BIAS_ERR", "", 3e-3, "N of one camera, a fraction of the usual counts, the same everywhere"
     ),
-    "leakage": ErrorWord("LEAK_ERR", "", 0.02, "N of one camera, a share of the light of another camera"),
+    "leakage": ErrorWord("LEAK_ERR", "", 0.02, "N of one camera, a fraction of the light of another camera"),
 }
 """The words of a primary header by the fields of `StatedErrors`."""
 
@@ -96,9 +98,9 @@ def _usual(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class StatedErrors:
-    """Standard errors of the numbers that a set states, each of a mistake that all of them have in common.
+    """Standard errors of the numbers that a set states, each of a systematic error that all of them have in common.
 
-    They say which mistakes to reckon with where the data would not show them. The search for a mistake is not limited
+    They say which errors to reckon with where the data would not show them. The search for an error is not limited
     by them: one that is far larger is found all the same. Units and usual sizes are those of `ERROR_WORDS`: what is
     left of an astrometric solution, of the clock of a computer, of a measured filter curve. 0: known exactly.
 
@@ -133,12 +135,12 @@ class StatedErrors:
 
     @property
     def stated(self) -> dict[str, float]:
-        """Those that differ from the usual ones."""
+        """The errors that differ from the usual ones, by name."""
         return {n: v for n, v in dataclasses.asdict(self).items() if v != ERROR_WORDS[n].usual}
 
     @classmethod
     def of(cls, given: Mapping[str, float]) -> StatedErrors:
-        """The usual errors, some of them given; ValueError, with the nearest names, for one that there is not."""
+        """The usual errors with some replaced; ValueError, with the nearest names, for a name that does not exist."""
         for name in given:
             if name not in ERROR_WORDS:
                 raise ValueError(f"stated_errors: there is none of {name!r}; {nearest(name, ERROR_WORDS)}")
@@ -146,7 +148,7 @@ class StatedErrors:
 
     @classmethod
     def largest(cls, given: Iterable[StatedErrors]) -> StatedErrors:
-        """Of each number the largest error."""
+        """For each number the largest of the errors given."""
         columns = zip(*(dataclasses.astuple(entry) for entry in given), strict=True)
         return cls(*map(max, columns))
 
@@ -169,10 +171,10 @@ class FilterCurve:
 
 @dataclasses.dataclass(frozen=True)
 class Position:
-    """State of a moving element in every exposure: in the beam or not, and at what angle.
+    """What a moving element does in every exposure (e): whether it is in the beam, and at what angle.
 
-    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle by
-    which it turns during the exposure, evenly in time (deg; 0, or None for all: it stands still).
+    `angle` is the encoder reading in degrees at mid-exposure, NaN where the element is out; `turn` is the angle (deg)
+    by which it turns during the exposure, evenly in time (0, or None for all exposures: it stands still).
     """
 
     inside: Bool[np.ndarray, " e"]
@@ -289,7 +291,7 @@ class Exposures:
         raise ValueError(f"the exposures have no moving element {prefix!r}: {advice}{like}")
 
     def placed(self, **positions: Position) -> Exposures:
-        """The same with moving elements, by column prefix, at other positions."""
+        """The exposures with moving elements, by column prefix, at other positions."""
         return dataclasses.replace(self, positions={**self.positions, **positions})
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -383,7 +385,7 @@ Arrays = TypeVar("Arrays")
 
 
 def _one_after_the_other(kind: type[Arrays], parts: Sequence[Arrays]) -> Arrays:
-    """A record of arrays whose arrays are those of some parts, joined along their first axis."""
+    """A record whose arrays are the arrays of all `parts`, joined along their first axis."""
     names = [field.name for field in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -422,8 +424,8 @@ class FineStructure:
     """Structure in whole frames that is finer than their cells, in patches of the field at `x`, `y` (degrees).
 
     `gain` is the mean square, over the pixels of a patch, of the relative gain of a camera against its surroundings, as
-    far as exposures agree on it; chance makes it negative as well. `error` is its standard error without any structure.
-    Patches of several files stand one after the other.
+    far as exposures agree on it; chance can make it negative. `error` is the standard error that it has without any
+    structure. Patches of several files stand one after the other.
     """
 
     x: Float[np.ndarray, " n"]
@@ -465,11 +467,11 @@ class FineStructure:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrationSet(Displayed):
-    """A calibration set, read, checked and free of units.
+    """A calibration set, read and checked; numbers have the units of the docstrings.
 
-    `intensities` gives the data of a slice of the points. `fine` is the structure that is finer than the cells of whole
-    frames, in a set that was made of these, `cells` how many along their longer side were asked for. `stated_errors`
-    are those of the numbers of the set.
+    `intensities` gives the data of a slice of the points. In a set that was made of whole frames, `fine` is the
+    structure that is finer than its cells, and `cells` how many cells along their longer side were asked for.
+    `stated_errors` are the errors of the numbers of the set.
 
     >>> calset.instrument, len(calset.exposures), len(calset.points)
     ('WALOP-SOUTH', 14, 29)
@@ -495,7 +497,7 @@ class CalibrationSet(Displayed):
         return self.intensities.cameras
 
     def display(self) -> Display:
-        """Summary of the observations."""
+        """What was observed: exposures by KIND, field points, standards, filters, remarks."""
         e, points = self.exposures, self.points
         kinds = ", ".join(f"{number} {kind}" for kind, number in Counter(e.kind.tolist()).items())
         x, y = (f"{values.min():+.3f} … {values.max():+.3f}°" for values in (points.x, points.y))
@@ -557,8 +559,8 @@ class CalibrationSet(Displayed):
 class Intensities:
     """The intensities of every (exposure, point): a table, or any other source.
 
-    `block` must be pure and may be called from several threads; the field points it counts in are those
-    of `CalibrationSet.points`, the exposures those of `CalibrationSet.exposures`.
+    `block` must be pure and may be called from several threads. It counts field points as `CalibrationSet.points` does,
+    and exposures as `CalibrationSet.exposures`.
     """
 
     def block(self, start: int, stop: int) -> Block:
@@ -577,9 +579,9 @@ class Intensities:
 
 
 def sampled(intensities: Intensities, total: int, most: int) -> tuple[Int[np.ndarray, " p"], Block]:
-    """Field points of a set of so many, `most` at most and in evenly spaced runs, and their data."""
+    """At most `most` of the `total` field points of a set, in evenly spaced blocks of neighbours, and their data."""
     if total <= most:
         return np.arange(total), intensities.block(0, total)
-    starts = np.linspace(0, total - RUN, most // RUN).astype(int)
-    blocks = [intensities.block(start, start + RUN) for start in starts.tolist()]
-    return (starts[:, None] + np.arange(RUN)).ravel(), Block.joined(blocks)
+    starts = np.linspace(0, total - SAMPLED_TOGETHER, most // SAMPLED_TOGETHER).astype(int)
+    blocks = [intensities.block(start, start + SAMPLED_TOGETHER) for start in starts.tolist()]
+    return (starts[:, None] + np.arange(SAMPLED_TOGETHER)).ravel(), Block.joined(blocks)

@@ -21,11 +21,11 @@ _LOOKED_AT = 4096  # field points whose counts are compared
 def mask_repeats(
     intensities: TableIntensities, exposures: Exposures, file: object
 ) -> tuple[TableIntensities, list[str]]:
-    """Find exposures that are copies of an earlier one and stop using them, lest errors shrink; say which.
+    """Find exposures that are copies of an earlier one and stop using them, so that errors do not shrink; say which.
 
     A copy has the same time, settings, points and counts to the last bit. Other counts of the same points at the same
-    time and settings are an error where most times differ (raises `DataError` that names `file`), and remarked on
-    where times are too coarse to tell.
+    time and settings are an error where most times differ (raises `DataError` that names `file`); where times are too
+    coarse to tell, there is a remark.
     """
     settings = [values for name, values in exposures.columns().items() if name != "EXPOSURE"]
     groups: dict[tuple[str, ...], list[int]] = {}

@@ -20,7 +20,7 @@ from walop_jax.data.records import DataFlag
 from walop_jax.data.units import Place, check_units, convert_unit, differs, partner_of, unit_of
 from walop_jax.io.errors import nearest, rows_text
 
-Kind = Literal["int", "float", "bool", "str"]
+ColumnType = Literal["int", "float", "bool", "str"]
 
 CALVERS = 2
 """Version of the calibration set format that is written. Sets of version 1 are sets of version 2 as well."""
@@ -35,12 +35,12 @@ class Rule(NamedTuple):
 
 
 def finite(advice: str) -> Rule:
-    """No NaN, no infinity."""
+    """The rule that a value is neither NaN nor infinite."""
     return Rule(lambda values: ~np.isfinite(values), "is not finite", advice)
 
 
 def within(limit: float, advice: str, what: str = "") -> Rule:
-    """From −`limit` to `limit`; NaN passes."""
+    """The rule that a value lies from −`limit` to `limit`; NaN passes."""
     return Rule(lambda values: np.abs(values) > limit, what or f"exceeds ±{limit:g}", advice)
 
 
@@ -62,7 +62,7 @@ class Column:
     truth value stands for.
     """
 
-    kind: Kind
+    kind: ColumnType
     unit: str = ""
     missing: Any = None
     width: int | None = 1

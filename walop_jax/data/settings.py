@@ -44,9 +44,9 @@ _TELLING = 3  # letters from which on case tells nothing: R and r are two filter
 
 
 def same_filters(name: str, names: Iterable[str]) -> list[str]:
-    """Those of `names` that are one name with `name`: itself; else all that differ in case, blanks and dashes alone.
+    """Names among `names` that mean the filter `name`: itself, else all that differ in case, blanks and dashes alone.
 
-    Of names with fewer than three letters and digits case counts.
+    Case counts in names with fewer than three letters and digits.
 
     >>> same_filters("sdss r", ["SDSS-r", "SDSS-i"]), same_filters("r", ["R"])
     (['SDSS-r'], [])
@@ -64,7 +64,7 @@ def builtin_filter(name: str) -> FilterCurve:
     """Return a built-in filter curve by name; wavelength in µm.
 
     `SDSS-r` is the r curve of the SDSS camera as measured by Doi et al. 2010, AJ 139, 1628, Table 4, for an
-    airmass of 1.3. The curve counts photons: it is the share of the photons at each wavelength that is detected.
+    airmass of 1.3. The curve counts photons: it is the fraction of the photons at each wavelength that is detected.
 
     `MONO-6500` is light of 6500 Å alone, and so on. Raises `DataError` with the nearest names if there is no such
     filter.
@@ -80,7 +80,7 @@ def builtin_filter(name: str) -> FilterCurve:
     return FilterCurve(name=name, wavelength=wavelength * 1e-4, throughput=throughput.copy())
 
 
-Rows = slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " n"]
+RowSelection = slice | Int[np.ndarray, " r"] | Bool[np.ndarray, " n"]
 
 TEMPERATURE = 10.0
 """Temperature of the instrument (Celsius) where nothing is said of it."""
@@ -94,12 +94,13 @@ def nearest_hours(hour_angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Optical settings, one per row.
+    """Optical settings, one per row (n).
 
-    Filter name; colour temperature of the source (K; NaN: flat photon spectrum); temperature of the instrument
-    (Celsius); hour angle (h); `positions` of the moving elements behind the polariser by column prefix (deg; NaN: out).
-    `turns` holds by how much those turn during the exposure that do not stand still (deg, about that angle).
-    An element that is not there is out. Raises ValueError for columns of different lengths.
+    A row is the name of a filter; the colour temperature of the source (K; NaN: flat photon spectrum); the temperature
+    of the instrument (Celsius); the hour angle (h); and `positions` of the moving elements behind the polariser by
+    column prefix (deg; NaN: out). `turns` holds, for elements that turn during the exposure, by how much (deg, about
+    that position). An element without a position is out of the beam. Raises ValueError for columns of different
+    lengths.
 
     >>> walop.Settings.default(2).at(CHWP=22.5).positions
     {'CHWP': array([22.5, 22.5])}
@@ -119,16 +120,16 @@ class Settings:
 
     @classmethod
     def default(cls, count: int, filter_name: str = DEFAULT_FILTER) -> Settings:
-        """SDSS-r, flat photon spectrum, all moving elements out, 10 °C, on the meridian."""
+        """Settings with SDSS-r, a flat photon spectrum, all moving elements out, 10 °C, on the meridian."""
         teff, temperature = np.full(count, np.nan), np.full(count, TEMPERATURE)
         return cls(np.full(count, filter_name), teff, temperature, hour_angle=np.zeros(count))
 
     @classmethod
     def of(cls, exposures: Exposures, moving: Iterable[str]) -> Settings:
-        """Those of exposures, of an instrument with the moving elements `moving` behind its polariser.
+        """The settings of exposures, for an instrument with the moving elements `moving` behind its polariser.
 
-        A temperature that is missing is that of `default`, an hour angle 0. Raises ValueError for a moving element of
-        which the exposures say nothing.
+        A missing temperature is taken as in `default`, a missing hour angle as 0. Raises ValueError for a moving
+        element of which the exposures say nothing.
         """
         positions = {prefix: exposures.position(prefix) for prefix in moving}
         return cls(
@@ -141,7 +142,7 @@ class Settings:
         )
 
     def at(self, **positions: float | Float[np.ndarray, " n"] | None) -> Settings:
-        """The same with moving elements at these angles (deg, by column prefix; None or NaN: out)."""
+        """These settings with moving elements at other angles (deg, by column prefix; None or NaN: out)."""
         angles = {
             prefix: np.broadcast_to(np.asarray(np.nan if angle is None else angle, float), len(self)).copy()
             for prefix, angle in positions.items()
@@ -151,7 +152,7 @@ class Settings:
     def __len__(self) -> int:
         return len(self.teff)
 
-    def __getitem__(self, rows: Rows) -> Settings:
+    def __getitem__(self, rows: RowSelection) -> Settings:
         return Settings(
             *(values[rows] for values in self._plain()),
             positions={prefix: angle[rows] for prefix, angle in self.positions.items()},

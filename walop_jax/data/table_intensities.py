@@ -20,7 +20,7 @@ NEGATIVE = 5.0
 """Counts below minus this many sigma are no bias-subtracted counts but a fault."""
 
 SPOILT = 0.2
-"""Above this share of unusable rows the set is refused, not masked."""
+"""Above this fraction of unusable rows the set is refused, not masked."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -247,8 +247,8 @@ def _source_rows(
         listed = ", ".join(str(entry) for entry in sources.source[:10]) or "none"
         what = f"a standard star needs a row of SOURCES; {ids[np.argmax(bad)]} is not one,"
         place.refuse(bad, what, "SOURCE", f"SOURCES has {listed}")
-    indoors = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
-    lamp = np.isin(exposures.kind, indoors)[exposure] & used & (ids >= 0)
+    lamp_kinds = [name for name, kind in KINDS.items() if not kind.from_sky and not kind.flux_known]
+    lamp = np.isin(exposures.kind, lamp_kinds)[exposure] & used & (ids >= 0)
     place.refuse(lamp, "a lamp is no source of the sky,", "SOURCE", "write −1, or another KIND")
     lost = np.flatnonzero(used & (ids >= 0) & (rows < 0))
     remark = place.remark(f"not in SOURCES, taken as unknown in {rows_text(lost)}", "SOURCE")

@@ -16,7 +16,7 @@ from walop_jax.io.errors import fail, rows_text
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Origin of a table, so that every check can name it."""
+    """Where a table comes from (file and extension), so that every check can name it."""
 
     file: object
     extension: str
@@ -77,7 +77,7 @@ TOGETHER: Mapping[str, str] = {"Y": "X", "U": "Q"}
 
 
 def partner_of(name: str) -> str:
-    """The column whose unit a column shares: of an error (N_ERR, N0_ERR) that of its value; else itself."""
+    """The column that has the unit of this one: N for its error N_ERR; the column itself otherwise."""
     value = name.replace("_ERR", "")
     return TOGETHER.get(value, value) if value == name else value
 
@@ -92,7 +92,7 @@ def check_units(given: Mapping[str, str], wanted: str, place: Place) -> None:
 
 
 def differs(unit: str, wanted: str) -> bool:
-    """True where a unit is to be converted."""
+    """True where a column in `unit` must be converted to `wanted`."""
     try:
         return units.Unit(unit) != units.Unit(wanted)
     except ValueError:

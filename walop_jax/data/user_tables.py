@@ -183,7 +183,7 @@ def numeric_column(source: InputTable, name: str, rule: Column) -> np.ndarray:
     return np.full(source.rows, rule.missing)
 
 
-_FEWEST_STARS = 10  # from which on the shape of a field tells hours from degrees
+_FEWEST_STARS = 10  # stars from which on the shape of a field tells hours from degrees
 _FLAT = 0.25  # of the extent in declination: hours taken as degrees have a fifteenth
 
 

@@ -33,10 +33,10 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct, sentences_in
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
-from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import sentences_of
 from walop_jax.diagnosis.score import FAINTEST, Matrix, Vector, log_bayes
 from walop_jax.diagnosis.synonyms import ALIKE
+from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.fit.refit import PRIOR_EDGE
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described

@@ -140,7 +140,7 @@ class Classes(NamedTuple):
         ahead = None if polariser is None else ("ahead of", polariser.name)
         optical = (change for change in described if change.kind in GENERATORS)
         places = dict.fromkeys(
-            _place(c) for c in optical if not c.beside_field or (c.where, c.place) != ahead
+            _place(c) for c in optical if not c.beside_field or (c.relation, c.place) != ahead
         )
         others = [c.text for c in changes if c.kind not in GENERATORS or _place(c) not in places]
         return Deviations.of(context, places=places, sentences=others) if changes else None
@@ -148,7 +148,7 @@ class Classes(NamedTuple):
 
 def _place(change: Sentence) -> str:
     """Place and dependence of a change of polarisation, as `Deviations` lists it."""
-    return " * ".join((f"{change.where} {change.place}", *change.beside_field))
+    return " * ".join((f"{change.relation} {change.place}", *change.beside_field))
 
 
 def with_average(result: FitResult, classes: Classes) -> FitResult:

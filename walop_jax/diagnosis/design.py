@@ -104,7 +104,7 @@ class Measured:
         self.counts: Cube = likelihood.points.gathered("counts")
         self.used: Bool[np.ndarray, "p e"] = likelihood.used
         self.flux, self.residual = likelihood.residuals(values)
-        self.shared = likelihood.sharing
+        self.shared = likelihood.flux_groups
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         residual = self.shared.independent(self.residual, inverse=True)

@@ -45,11 +45,11 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, Matrix, Vector, examine, most_points, smallest
 from walop_jax.diagnosis.grammar import hypotheses
-from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
 from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
+from walop_jax.diagnosis.undetected_errors import undetected_errors
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
@@ -321,8 +321,8 @@ def detection_limits(
     errors = _errors(examination, columns)
     design = examination.design
     if (hidden := result.hidden) is None:
-        hidden = hidden_mistakes(design, Singles.of(design))
-    examined = result if result.verdict is not None else result.judged()
+        hidden = undetected_errors(design, Singles.of(design))
+    examined = result if result.verdict is not None else result.with_verdict()
     calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
     limits = _collected(examination, columns, errors, listed.effects, calibration)
     return dataclasses.replace(
@@ -462,7 +462,7 @@ def _collected(
     hidden = hidden_errors(calibration, points.x, points.y, setting)
     assert calibration.hidden is not None
     all_errors = np.vstack([SECOND_ORDER * errors, hidden, np.full((1, len(points)), np.nan)])
-    names_of = (*(c.probe.effect.name for c in columns), *(m.name for m in calibration.hidden.mistakes), "")
+    names_of = (*(c.probe.effect.name for c in columns), *(m.name for m in calibration.hidden.errors), "")
     worst = np.where(np.isfinite(all_errors), all_errors, -1.0)
     largest = worst.argmax(axis=0)
     protection = worst[largest, np.arange(len(points))]

@@ -109,7 +109,9 @@ def shape_of(laid: Laid) -> Shape | None:
     _, at_any = laid.added([((1.0, change),) for change in steady])
     acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
     # Of other dependences than those described stars have none: each is a program's worth of derivatives.
-    on_stars = tuple(j for j, c in enumerate(changes) if acting[j] and c.of_stars and c.beside_field in laws)
+    on_stars = tuple(
+        j for j, c in enumerate(changes) if acting[j] and c.applies_to_catalogue and c.beside_field in laws
+    )
     spread = laid.error_of_p(between)
     return Shape(tuple(changes), moment, member.slopes, on_stars, spread, laid.stated)
 
@@ -137,7 +139,9 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vec
     laws: dict[_Place, dict[tuple[str, ...], None]] = {}
     for change, amplitude in described.terms():
         optical = change.kind.partition(" ")[0] in _OPTICS
-        place = _Place(GENERATORS if optical else (change.kind,), change.where, change.place, change.origin)
+        place = _Place(
+            GENERATORS if optical else (change.kind,), change.relation, change.place, change.origin
+        )
         parts = generators_of(change.kind) if optical else ((change.kind, 1.0, ()),)
         for _, coefficient, factors in parts:
             size = float(amplitude) * coefficient * data.rms(change.times(*factors))
@@ -338,7 +342,9 @@ def _no_starlight(probe: Probe, template: Instrument) -> bool:
     """True of a candidate that changes calibration exposures and not the light of stars."""
     changes = [c for member in probe.group for total in member.first_order(template) for _, c in total]
     laws = ({item.depends_on for item in change.grows_with} & {EXPOSURE, COUNTS} for change in changes)
-    return bool(changes) and all(law or not c.of_stars for law, c in zip(laws, changes, strict=True))
+    return bool(changes) and all(
+        law or not c.applies_to_catalogue for law, c in zip(laws, changes, strict=True)
+    )
 
 
 def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:

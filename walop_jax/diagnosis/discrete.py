@@ -52,9 +52,10 @@ from walop_jax.diagnosis.readings import (
 )
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.model_of_set import model_like
-from walop_jax.fit.refit import FitResult, Vector
+from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.io.errors import DataError
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import alternatives
@@ -213,7 +214,7 @@ class _Look:
         place, least = {item.what: n for n, item in enumerate(items)}, good[0].explained
         alike = [item for item in good if item.explained < thresholds.READING_ALIKE * least]
         # Within an odds ratio of e³ the data do not say which: the commoner one is listed first.
-        free = max(self.likelihood.census.n_data, 1)
+        free = max(self.likelihood.used_data.n_data, 1)
         equal = least + 2.0 * thresholds.EVEN_ODDS / free
         return tuple(
             sorted(

@@ -33,7 +33,8 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
-from walop_jax.fit.refit import PRIOR_EDGE, FitResult, Vector, fit
+from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
@@ -161,7 +162,7 @@ def _try_model(
         likelihood,
         start=np.array([start.get(p.name, p.start) for p in model.parameters]),
         noise_scale=base.noise_scale,
-        worth=base.expansion.objective,
+        target_objective=base.expansion.objective,
     )
     bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.expansion.matrix).all():

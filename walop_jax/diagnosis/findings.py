@@ -269,7 +269,7 @@ class Diagnosis(Drawn):
     that were scored.
     """
 
-    first_figure = "ladder"
+    _first_figure = "ladder"
 
     verdict: Outcome
     steps: tuple[Step, ...]
@@ -427,7 +427,7 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
     return {
         "sentence": change.text,
         "kind": change.kind,
-        "place": f"{change.where} {change.place}",
+        "place": f"{change.relation} {change.place}",
         "dependence": dependence,
         "value": amplitude,
         "sigma": sigma,

@@ -6,7 +6,7 @@ sine, a gradient two directions.
     kinds         those of `model.effects`, in the groups of `optics.GROUPS`
     places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
                   the polariser, another moving element, a wave plate, a camera, an arm, a source
-    dependence    those that `Kind.grows` names of a kind at a place: patterns over the field, each with every
+    dependence    those that `ChangeKind.grows` names of a kind at a place: patterns over the field, each with every
                   dependence on wavelength, time, temperature, hour angle, angles, exposures and counts
                   (`Combinations`), of those that the exposures can distinguish (`Dependences`)
 
@@ -146,7 +146,9 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
         shown = Dependences(exposures, over_field, prefixes, everything if inside is None else inside)
         first = bases["alone"][0][0]
-        order = -1 if first.where in ("behind", "ahead of") else 1  # between elements the pattern comes first
+        order = (
+            -1 if first.relation in ("behind", "ahead of") else 1
+        )  # between elements the pattern comes first
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
             patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
             factors = itertools.chain(*map(shown.of, along))

@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.score import Candidate, Score, Vector
 from walop_jax.io.text import rounded
-from walop_jax.likelihood.columns import Change, Columns, own_columns
+from walop_jax.likelihood.columns import Columns, SumOfSentences, own_columns
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
@@ -184,7 +184,7 @@ def candidates_by_points(
     likelihood, template = columns.likelihood, columns.likelihood.model.template
     effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
     shown = [*effects, *(p for p in wanted if p.effect is Described)]
-    linear: dict[str, list[Change]] = {}
+    linear: dict[str, list[SumOfSentences]] = {}
     for probe in shown:
         members = [member.first_order(template) for member in probe.group]
         if all(terms and all(map(columns.has, terms)) for terms in members):

@@ -25,9 +25,9 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hidden_mistakes import usual_exposure
 from walop_jax.diagnosis.hypotheses import Probe, sentences_of
 from walop_jax.diagnosis.score import Candidate, ScoreSpace
+from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 

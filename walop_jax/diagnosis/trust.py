@@ -43,12 +43,12 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design, pattern_in_words, pattern_scores
 from walop_jax.diagnosis.discrete import refuse_mixups
-from walop_jax.diagnosis.hidden_mistakes import hidden_mistakes
 from walop_jax.diagnosis.hypotheses import Probe, candidates_by_points
 from walop_jax.diagnosis.readings import refuse_dead_cameras
 from walop_jax.diagnosis.remedies import remedies
 from walop_jax.diagnosis.score import Blocks, Projector, ScoreSpace, ScoreTable, effective_trials, local_p
 from walop_jax.diagnosis.stated_conditions import Singles, stated_conditions
+from walop_jax.diagnosis.undetected_errors import undetected_errors
 from walop_jax.diagnosis.variance_components import (
     found_components,
     in_words,
@@ -57,7 +57,7 @@ from walop_jax.diagnosis.variance_components import (
     variance_components,
     with_structure,
 )
-from walop_jax.fit.refit import FitResult, with_honest_errors
+from walop_jax.fit.refit import FitResult, with_empirical_covariance
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import beside, some
@@ -100,17 +100,17 @@ def examined(
     if not result.converged:
         if not as_written and result.chi2 > FAR_OFF * max(result.dof, 1):
             refuse_mixups(result)
-        return result.judged()
+        return result.with_verdict()
     near = result.explains_data or result.nearly_explains_data
     if not (near or as_written):
         refuse_mixups(result)
     seen = sampled(result)
     cures = () if near else _remedies(result, seen, seed)
     if cures:
-        return result.judged(remedies=cures)
+        return result.with_verdict(remedies=cures)
     design = Design.of(seen)
     if result.errors_too_large and _hold_no_noise(design):
-        return result.judged(noiseless=True)
+        return result.with_verdict(noiseless=True)
     places = design if seen is result or result.calset.fine is None else Design.of(_spread(result))
     asked = [c for c in variance_components(design) if places is design or not c.grouping.structure]
     if places is not design:
@@ -119,7 +119,7 @@ def examined(
     hidden = singles = None
     if near:
         singles = Singles.of(design)
-        hidden = hidden_mistakes(design, singles)
+        hidden = undetected_errors(design, singles)
         doubts = (
             *stated_conditions(design, singles),
             *_significant(
@@ -140,14 +140,14 @@ def examined(
         doubts = (*stated_conditions(design), *in_words(components))
     doubts = (*doubts, *_finer(result))
     structure = structure_of(components)
-    final = with_honest_errors(result)
+    final = with_empirical_covariance(result)
     if structure:
         final = with_structure(final, places, components, len(result.calset.points))
-    final = final.judged(doubts, structure=_with_finer(result, structure))
+    final = final.with_verdict(doubts, structure=_with_finer(result, structure))
     if unseen := hidden.not_measured() if hidden is not None else ():
-        final = final.remarked(NOT_MEASURED.format("; ".join(unseen)))
+        final = final.with_remark(NOT_MEASURED.format("; ".join(unseen)))
     for what in singles.of_noise if singles is not None else ():
-        final = final.remarked(MADE_OF_N.format(what))
+        final = final.with_remark(MADE_OF_N.format(what))
     return dataclasses.replace(final, hidden=hidden)
 
 

@@ -44,7 +44,7 @@ from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit, with_honest_errors
+from walop_jax.fit.refit import fit, with_empirical_covariance
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
@@ -182,18 +182,20 @@ def _examined(
 
     `tables` are the scores of the fits before and after.
     """
-    after = examined(with_honest_errors(diagnosis.after), seed, as_written=True, candidates=tables[1])
+    after = examined(with_empirical_covariance(diagnosis.after), seed, as_written=True, candidates=tables[1])
     for sentence in only_a_class(diagnosis.members):
-        after = after.doubted(Quality.CLASS_ONLY, sentence)
+        after = after.with_doubt(Quality.CLASS_ONLY, sentence)
     after = with_average(after, diagnosis.members)
     if diagnosis.before is diagnosis.after:
         return dataclasses.replace(diagnosis, before=after, after=after)
     for sentence in rivals:
-        after = after.remarked(sentence)
+        after = after.with_remark(sentence)
     before = diagnosis.before
     # Where χ² contradicts the model given, the steps name the missing effects.
     explained = before.explains_data or before.nearly_explains_data
-    before = examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.judged()
+    before = (
+        examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.with_verdict()
+    )
     return dataclasses.replace(diagnosis, before=before, after=after)
 
 

@@ -35,7 +35,7 @@ class Commands(SphinxDirective):
     """A section for every command: its docstring and its options."""
 
     def run(self) -> list[nodes.Node]:
-        """The sections."""
+        """The sections about the commands, each made of its help."""
         parts = []
         for name in COMMANDS:
             command = getattr(walop_jax, name.replace("-", "_")).command
@@ -54,7 +54,7 @@ class Names(SphinxDirective):
     """A section for every public name that is not a command: its signature and its docstring."""
 
     def run(self) -> list[nodes.Node]:
-        """The sections."""
+        """The sections about the public names, each made of its docstring."""
         parts = []
         commands = {name.replace("-", "_") for name in COMMANDS}
         for name in sorted(set(walop_jax.__all__) - commands - {"Scalar", "EFFECTS"}):
@@ -92,7 +92,7 @@ class Gallery(SphinxDirective):
 
 
 def setup(app: Sphinx) -> None:
-    """Make the directives known."""
+    """Register the directives with Sphinx."""
     app.add_directive("walop-commands", Commands)
     app.add_directive("walop-names", Names)
     app.add_directive("walop-gallery", Gallery)

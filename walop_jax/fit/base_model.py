@@ -1,7 +1,8 @@
 """The base model of a calibration set, which has no effects.
 
-The scale of the throughput is a gauge unless a flux is known: the constant of camera N0 is held then. Of two cameras,
-and where every arm has a flux of its own, the whole series of the first one is: only ratios can be known.
+Unless a flux is known, the scale of the throughput cannot be determined: the constant of camera N0 is fixed then. Of
+two cameras, and where every arm has a flux of its own, only ratios can be known: the whole series of the first camera
+of each arm is fixed.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ def base_model(
 
 
 def _level(calset: CalibrationSet) -> float:
-    """Level of the throughput: that of the first field points with a known flux, `LEVEL` where there are none.
+    """Start value of the throughput: its level at the first field points with a known flux, `LEVEL` where there are
+    none.
 
     A camera gets half of the unpolarised light: N = T/2.
     """
@@ -85,12 +87,14 @@ def _level(calset: CalibrationSet) -> float:
 
 
 def gauges(model: Model, flux_known: bool) -> list[str]:
-    """Parameters degenerate with fluxes: the scale of the throughput, or all terms common to the cameras of an arm."""
+    """Names of the parameters that the unknown fluxes make undeterminable: the scale of the throughput, or whole series
+    of it.
+    """
     cameras = model.template.cameras
     if flux_known and not cameras.split:
         return []
-    units = tuple(f"throughput.n{camera}." for camera in cameras.units)
-    return [name for name in model.names if name.startswith(units)] if units else [GAUGE]
+    series = tuple(f"throughput.n{camera}." for camera in cameras.ratio_references)
+    return [name for name in model.names if name.startswith(series)] if series else [GAUGE]
 
 
 def instrument_of(calset: CalibrationSet) -> Instrument:

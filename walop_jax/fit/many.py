@@ -38,15 +38,15 @@ from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.engine import Normal, PointData
+from walop_jax.likelihood.engine import NormalEquations, PointData
 from walop_jax.likelihood.layout import PointReader
 from walop_jax.likelihood.likelihood import (
-    Census,
     DataTerms,
     Expansion,
     Likelihood,
     MeasuredPoints,
     OpticsUsed,
+    UsedData,
 )
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
@@ -96,7 +96,7 @@ class ManyFits(Displayed):
 
     @property
     def sigma(self) -> Float[np.ndarray, "s n"]:
-        """Standard errors of all parameters as each fit states them; 0 for frozen ones."""
+        """Standard errors (s, n) of all parameters as each fit states them; 0 for fixed parameters."""
         return np.stack([one.sigma for one in self.fits])
 
     @property
@@ -186,9 +186,9 @@ def fitted_together(
     likelihoods = _likelihoods(calsets, model)
     inputs = [_inputs(one) for one in likelihoods]
     # The points have been read: they are not read a second time for their numbers.
-    censuses = [one.counted(data) for one, (_, _, data) in zip(likelihoods, inputs, strict=True)]
-    for one, census in zip(likelihoods, censuses, strict=True):
-        check_identifiable(one, census)
+    used_data = [one.counted(data) for one, (_, _, data) in zip(likelihoods, inputs, strict=True)]
+    for one, used in zip(likelihoods, used_data, strict=True):
+        check_identifiable(one, used)
     first = fit(likelihoods[0])
     if first.model.template.noise is not None:
         others = tuple(fit(one) for one in likelihoods[1:])
@@ -206,7 +206,7 @@ def fitted_together(
         if n > 0
     }
     results, alone = [first], []
-    for n, minimum in sorted(_driven(searches, stack, likelihoods, censuses, tell).items()):
+    for n, minimum in sorted(_driven(searches, stack, likelihoods, used_data, tell).items()):
         if _is_of_a_single_fit(likelihoods[n], minimum):
             results.append(fit_at(likelihoods[n], minimum, 0.0))
         else:
@@ -236,7 +236,7 @@ def _driven(
     searches: dict[int, Any],
     stack: Stack,
     likelihoods: Sequence[Likelihood],
-    censuses: Sequence[Census],
+    used_data: Sequence[UsedData],
     tell: Callable[[int, int], None],
 ) -> dict[int, Minimum[Expansion]]:
     """The minima of searches by their position."""
@@ -246,7 +246,7 @@ def _driven(
         tell(len(found), len(searches))
         numbers = list(places)
         values = np.stack([likelihoods[n].model.full(places[n]) for n in numbers])
-        expansions = _expansions(stack, likelihoods, censuses, numbers, values)
+        expansions = _expansions(stack, likelihoods, used_data, numbers, values)
         places = {}
         for n, expansion in zip(numbers, expansions, strict=True):
             try:
@@ -259,7 +259,7 @@ def _driven(
 def _expansions(
     stack: Stack,
     likelihoods: Sequence[Likelihood],
-    censuses: Sequence[Census],
+    used_data: Sequence[UsedData],
     numbers: Sequence[int],
     values: Float[np.ndarray, "s n"],
 ) -> Iterator[Expansion]:
@@ -268,10 +268,14 @@ def _expansions(
         some = list(numbers[begin : begin + TOGETHER])
         filled = np.array([*some, *[some[-1]] * (min(TOGETHER, len(likelihoods)) - len(some))])
         rows = np.minimum(np.arange(begin, begin + len(filled)), begin + len(some) - 1)
-        normal = Normal(*map(np.asarray, equations_of_many(stack.taken(filled), array(values[rows]))))
+        normal = NormalEquations(
+            *map(np.asarray, equations_of_many(stack.taken(filled), array(values[rows])))
+        )
         for k, n in enumerate(some):
             likelihood = likelihoods[n]
-            terms = DataTerms(float(normal.chi2[k]), normal.gradient[k].copy(), normal.matrix[k], censuses[n])
+            terms = DataTerms(
+                float(normal.chi2[k]), normal.gradient[k].copy(), normal.matrix[k], used_data[n]
+            )
             yield likelihood.expanded(values[begin + k], terms, 1.0, OpticsUsed(None))
 
 
@@ -392,15 +396,15 @@ def _same(one: Any, other: Any) -> bool:
 # --------------------------------------------------------------------------------------------------------- the program
 
 
-def _equations_of_many(stack: Stack, values: Float[Array, "s n"]) -> Normal:
+def _equations_of_many(stack: Stack, values: Float[Array, "s n"]) -> NormalEquations:
     """χ², Jᵀr and JᵀJ of the sets of a stack, each at its own values of all parameters."""
 
-    def one(given: tuple[Sequence[Array], Array]) -> Normal:
+    def one(given: tuple[Sequence[Array], Array]) -> NormalEquations:
         varying, at = given
         template, plan, data = stack.tree(varying)
         residual, slope = engine.residuals_and_slopes(with_values(template)(at), plan, data)
         r, jacobian = residual.reshape(-1), slope.reshape(-1, at.size)
-        return Normal(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
+        return NormalEquations(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
 
     # One after the other on a CPU, whose cache holds the Jacobian of one set; side by side where there are many cores.
     side_by_side = None if jax.default_backend() == "cpu" else TOGETHER

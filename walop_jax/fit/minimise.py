@@ -30,8 +30,8 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import scipy.linalg
-from jaxtyping import Float
 
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.model.compiled import compiled
 
 SOURCE = (
@@ -39,8 +39,6 @@ SOURCE = (
     "Dennis, Gay & Welsch 1981, ACM Trans. Math. Software 7, 348"
 )
 
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 RESULTS = optx.RESULTS
 
 MAXIMUM_STEPS = 200
@@ -50,37 +48,37 @@ ROUGH = 0.1
 ROUNDING = 1e-12  # of an objective: near the end two of them differ by less
 # Sums of many terms are good to some 10⁻¹⁵ of the largest eigenvalue: the smallest is then known to ten per cent.
 LARGEST_CONDITION = 1e14
-# Shares of the predicted reduction below which λ grows and above which it falls. With 0.01 steps go to and fro across a
-# valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved keeps its λ
-# and with it a slow end: directions that the data hardly see then take forty steps.
+# Fractions of the predicted reduction below which λ grows and above which it falls. With 0.01 steps go to and fro
+# across a valley that is bent twice as much as Gauss and Newton have it; with 0.99 a problem that is a little curved
+# keeps its λ and with it a slow end: directions that the data hardly see then take forty steps.
 BADLY_PREDICTED, WELL_PREDICTED = 0.25, 0.75
 
 
 @runtime_checkable
 class Quadratic(Protocol):
-    """Value, and half the gradient and Hessian, of the objective, at one place."""
+    """The objective at one place: its value, and half its gradient and Hessian there."""
 
     @property
     def objective(self) -> float:
-        """Value to be minimised."""
+        """The value to be minimised."""
         ...
 
     @property
     def gradient(self) -> Vector:
-        """Half the gradient."""
+        """Half the gradient (n) of the objective."""
         ...
 
     @property
     def matrix(self) -> Matrix:
-        """Half the Gauss–Newton Hessian."""
+        """Half the Gauss–Newton Hessian (n, n) of the objective."""
         ...
 
 
-Place = TypeVar("Place", bound=Quadratic)
+AnyQuadratic = TypeVar("AnyQuadratic", bound=Quadratic)
 
 
 @dataclasses.dataclass(frozen=True)
-class Minimum(Generic[Place]):
+class Minimum(Generic[AnyQuadratic]):
     """End of a search: `x` in the units it was given, the expansion there and the gates.
 
     `steps` counts the places looked at, `history` holds their objectives; `result` is a member of
@@ -88,7 +86,7 @@ class Minimum(Generic[Place]):
     """
 
     x: Vector
-    expansion: Place
+    expansion: AnyQuadratic
     result: optx.RESULTS
     message: str
     steps: int
@@ -104,16 +102,16 @@ class Minimum(Generic[Place]):
 
 
 def minimise(
-    evaluate: Callable[[Vector], Place],
+    evaluate: Callable[[Vector], AnyQuadratic],
     start: Vector,
     scale: Vector,
     **how: Any,
-) -> Minimum[Place]:
+) -> Minimum[AnyQuadratic]:
     """Minimise a sum of squares from `start`; `scale` is the unit of each parameter.
 
     `evaluate(x)` gives the objective and its expansion at x; `how` are the other arguments of `search_of`.
     """
-    search: Generator[Vector, Place, Minimum[Place]] = search_of(start, scale, **how)
+    search: Generator[Vector, AnyQuadratic, Minimum[AnyQuadratic]] = search_of(start, scale, **how)
     place = next(search)
     while True:
         try:
@@ -129,10 +127,10 @@ def search_of(
     damping: float = 1.0,
     maximum_steps: int = MAXIMUM_STEPS,
     tolerance: float = TOLERANCE,
-    far_off: Callable[[Place], bool] = lambda _: False,
+    far_off: Callable[[AnyQuadratic], bool] = lambda _: False,
     secant: bool = False,
-    progress: Callable[[int, Place], None] | None = None,
-) -> Generator[Vector, Place, Minimum[Place]]:
+    progress: Callable[[int, AnyQuadratic], None] | None = None,
+) -> Generator[Vector, AnyQuadratic, Minimum[AnyQuadratic]]:
     """The search for the minimum of a sum of squares, one place at a time: it asks for places, it is sent expansions.
 
     It yields the next place that it wants to know about, is sent the objective and its expansion there, and returns the
@@ -158,7 +156,7 @@ def search_of(
             current, result = candidate, RESULTS.nonfinite
             break
         lowered = current is None or candidate.objective < current.objective
-        size, accept = _judged(step, model, candidate, size)
+        size, accept = _accepted(step, model, candidate, size)
         if secant and current is not None:
             bent = _predicts_better(curvature, step, current, candidate)
             curvature = _secant(curvature, step, current, candidate)
@@ -195,10 +193,11 @@ def search_of(
 
 
 def distance_to_minimum(expansion: Quadratic) -> tuple[float, float]:
-    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with a diagonal of ones.
+    """‖(JᵀJ)^(−½) Jᵀr‖ in scaled parameters, and the condition number of JᵀJ with ones on its diagonal.
 
-    How well each parameter is known by itself is no matter of telling them apart: the best scaling is by that, up to
-    the number of parameters (van der Sluis 1969, Numerische Mathematik 14, 14).
+    The condition number should not depend on how well each parameter is known by itself, only on the correlations:
+    scaling by the diagonal is the best choice up to a factor, the number of parameters (van der Sluis 1969, Numerische
+    Mathematik 14, 14).
     """
     matrix, gradient = expansion.matrix, expansion.gradient
     if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
@@ -232,7 +231,7 @@ def _step(
 
     The step is not a number where the matrix is singular.
     """
-    if not len(scale):  # before SciPy 1.14 nothing was solved for nothing
+    if not len(scale):  # SciPy before 1.14 fails on empty systems
         return np.zeros(0), here
     models = [here]
     if curvature is not None:
@@ -247,7 +246,7 @@ def _step(
 
 
 def _predicts_better(curvature: Matrix, step: Vector, here: Quadratic, there: Quadratic) -> bool:
-    """True if S would have made the predicted change of the objective by a step less wrong."""
+    """True if, with S, the predicted change of the objective by a step would have been less wrong."""
     wrong = there.objective - here.objective - _change(step, here)
     return abs(wrong - float(step @ curvature @ step)) < abs(wrong)
 
@@ -275,8 +274,8 @@ def _change(step: Vector, here: Quadratic) -> float:
     return float(2.0 * here.gradient @ step + step @ here.matrix @ step)
 
 
-def _judged(step: Vector, here: Quadratic | None, there: Quadratic, size: float) -> tuple[float, bool]:
-    """Size of the trust region after a step from here to there, and whether it is taken."""
+def _accepted(step: Vector, here: Quadratic | None, there: Quadratic, size: float) -> tuple[float, bool]:
+    """Size of the trust region after a step from `here` to `there`, and whether the step is taken."""
     if here is None:
         return size, True
     objective = there.objective if np.isfinite(there.objective) else np.inf

@@ -33,7 +33,7 @@ class Misfit:
     """Mean squared normalised residual per intensity in each group, and rms disagreement of matrix elements.
 
     With the flux eliminated, noise alone gives 1 − 1/K per intensity of K cameras (1 where the flux is known).
-    `positions` are the angles of the moving elements by the prefix of their columns; `outliers` is the share of
+    `positions` are the angles of the moving elements by the prefix of their columns; `outliers` is the fraction of
     (exposure, point) pairs that lie off by themselves (`outliers.outlying`).
     """
 
@@ -90,7 +90,7 @@ def describe(result: FitResult) -> Misfit:
 
 
 def misfit_at(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Misfit:
-    """As `describe`, at any full vector of parameter values."""
+    """The groups of `describe` at any full vector of parameter values (n)."""
     if likelihood.layout.points > MISFIT_POINTS:
         likelihood = Likelihood.of(thinned(likelihood.calset, MISFIT_POINTS), likelihood.model)
     e, used, k = likelihood.calset.exposures, likelihood.used, likelihood.cameras

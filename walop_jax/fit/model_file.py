@@ -172,7 +172,7 @@ def _changes(parameter: Parameter, entry: Mapping[str, Any]) -> dict[str, Any]:
     return changes
 
 
-Catalogue = Sequence[EffectKind]
+EffectCatalogue = Sequence[EffectKind]
 
 
 def model_without_data(
@@ -181,7 +181,7 @@ def model_without_data(
     *,
     standards: Standards | Sequence[tuple[str, float, float]] = (),
     context: Context | None = None,
-    catalogue: Catalogue = EFFECTS,
+    catalogue: EffectCatalogue = EFFECTS,
 ) -> Model:
     """The model of an instrument as designed, for no data in particular.
 
@@ -193,7 +193,7 @@ def model_without_data(
 
     def build(header: ModelTable) -> Model:
         nominal = adapted(design, standards=standards, **header.of_instrument())
-        model = make_model(nominal.name, nominal, frozen=(GAUGE,))
+        model = make_model(nominal.name, nominal, fixed=(GAUGE,))
         model = dataclasses.replace(model, catalogue=known_to(header, catalogue))
         facts = {"sources": nominal.standard.names, "cameras": nominal.cameras.names, "units": nominal.units}
         return with_effects_of(model, header, context or Context(**facts))
@@ -201,7 +201,7 @@ def model_without_data(
     return parse(text, build)
 
 
-def known_to(header: ModelTable, catalogue: Catalogue) -> tuple[EffectKind, ...]:
+def known_to(header: ModelTable, catalogue: EffectCatalogue) -> tuple[EffectKind, ...]:
     """A catalogue with the entries that a model file brings along; those of the catalogue stay."""
     names = {effect.name for effect in catalogue}
     stated = {name: table for name, table in header.entries.items() if name not in names}

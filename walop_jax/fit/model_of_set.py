@@ -8,7 +8,7 @@ from typing import Any
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import SKY_AND_STARS, base_model
-from walop_jax.fit.model_file import Catalogue, ModelTable, header_of, known_to, parse, with_effects_of
+from walop_jax.fit.model_file import EffectCatalogue, ModelTable, header_of, known_to, parse, with_effects_of
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.text import with_error, with_minus_sign
 from walop_jax.model.effects import EFFECTS, Deviations
@@ -21,7 +21,7 @@ def model_for(
     calset: CalibrationSet,
     text: str = "",
     instrument: Instrument | None = None,
-    catalogue: Catalogue = EFFECTS,
+    catalogue: EffectCatalogue = EFFECTS,
 ) -> Model:
     """The base model of a calibration set, changed by a model file (TOML text); `instrument` as for `base_model`.
 
@@ -69,7 +69,7 @@ class ModelFile(Displayed):
     path: Path | None
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The model file as plain data, for `--json`."""
         keys, model = ("start", "unit", "prior", "free", "tie", "about"), self.model
         document = {"instrument": model.name, "effects": list(model.effect_names)}
         document |= {"output": None if self.path is None else str(self.path)}
@@ -80,7 +80,7 @@ class ModelFile(Displayed):
         where = self.model.name if self.path is None else self.path
         parameters, free = self.model.parameters, len(self.model.free)
         rows = tuple(
-            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, prior, p.state, p.about)
+            (p.name, with_minus_sign(f"{p.start + 0.0:.6g}"), p.unit, prior, p.freedom, p.about)
             for p in sorted(parameters, key=lambda p: p.name.startswith("standard."))
             for prior in ("" if p.prior is None else with_error(p.prior[0] + 0.0, p.prior[1]),)
             if p.part != THROUGHPUT

@@ -29,12 +29,14 @@ from walop_jax.model.specification import Model
 
 BEYOND = 5.0  # standard errors
 LEAST = 3.0  # standard errors: with less, noise would be clipped and the errors of the rest with it
-MOST = 0.05  # share of the rows
+MOST = 0.05  # fraction of the rows
 _GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 
 
 def outlying(likelihood: Likelihood, residual: Float[np.ndarray, "p e k"]) -> Bool[np.ndarray, "p e"]:
-    """Used rows of which a camera lies more than `BEYOND` standard errors off, of the normalised residuals."""
+    """True (p, e) for used rows of which a camera lies more than `BEYOND` standard errors off, given normalised
+    residuals.
+    """
     return _distance(likelihood, residual) > BEYOND
 
 

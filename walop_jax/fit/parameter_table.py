@@ -10,9 +10,10 @@ from jaxtyping import Float
 
 from walop_jax.io.display import Display, Result
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import value_and_error, with_error, with_minus_sign
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.specification import THROUGHPUT, Model, Vector
+from walop_jax.model.specification import THROUGHPUT, Model
 
 PRIOR_ONLY = 0.99  # of the prior width: an error above it owes nothing to the data
 PRIOR_WORDS = "prior only"
@@ -34,7 +35,9 @@ class ParameterValue(NamedTuple):
 
 
 class Fitted(Result):
-    """A model with values and a covariance of all its parameters, by name and as a table."""
+    """A model with values (n) and a covariance (n, n) of all its parameters, by name and as a table."""
+
+    _working = ("shown",)
 
     model: Model
     values: Vector
@@ -47,7 +50,7 @@ class Fitted(Result):
 
     @property
     def sigma(self) -> Vector:
-        """Standard errors of all parameters."""
+        """Standard errors (n) of all parameters, each in its unit; 0 for a fixed one."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     def __getitem__(self, name: str) -> ParameterValue:
@@ -66,7 +69,7 @@ class Fitted(Result):
 
 
 def unconstrained(model: Model, sigma: Vector) -> tuple[str, ...]:
-    """Names of the free parameters without information in the data: their error is the width of their prior."""
+    """Names of the free parameters on which the data hold no information: their error is the width of their prior."""
     return tuple(
         p.name
         for p, s in zip(model.parameters, sigma, strict=True)
@@ -125,4 +128,4 @@ def parameter_notes(model: Model, sigma: Vector) -> tuple[str, ...]:
 
 
 def _state(p: Parameter, idle: tuple[str, ...]) -> str:
-    return p.state or (PRIOR_WORDS if p.name in idle else "")
+    return p.freedom or (PRIOR_WORDS if p.name in idle else "")

@@ -29,18 +29,16 @@ from walop_jax.fit.verdict import (
     Verdict,
 )
 from walop_jax.io.display import Display
-from walop_jax.io.progress import Stage
+from walop_jax.io.progress import Stage, Tell
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.io.text import in_its_unit
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.layout import curves_of
 from walop_jax.likelihood.likelihood import Expansion, Likelihood
-from walop_jax.likelihood.runner import Progress, Runner
+from walop_jax.likelihood.runner import Runner
 from walop_jax.model.noise import NOISE
 from walop_jax.model.planning import extrapolations
 from walop_jax.model.specification import Model
-
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 
 NEARLY = 1.15  # χ²/dof that errors stated seven per cent too small give
 TOO_LOW = 0.8  # χ²/dof below which the stated errors are those of something else
@@ -67,18 +65,20 @@ class Alternatives(Protocol):
 class FitResult(Fitted):
     """A fit, the likelihood that it maximises, and the verdict on it.
 
-    `values` and `covariance` are of all parameters in tree order, frozen ones with zero variance. `verdict` is None
-    until the residuals were examined (`diagnosis.trust.examined`); to ask for `trusted` before is an error.
-    `errors_from` is the source of the covariance, the stated errors of the data (`STATED`) or residuals; `hidden`
-    are mistakes that the residuals would not show, None until these were examined. `alternatives` are the other models
-    that a diagnosis could not tell apart from this one: the calibration of the fit is the mean over all of them.
-    `clipped` are the rows that it left out as outliers, None if it was not asked to
+    `values` (n) and `covariance` (n, n) are of all parameters in tree order, each in its unit; fixed parameters have no
+    variance. `verdict` is None until the residuals are examined (`diagnosis.trust.examined`); to ask for `trusted`
+    before that is an error. `errors_from` is the source of the covariance: the stated errors of the data (`STATED`) or
+    the residuals. `hidden` are the errors that the data would not show, None until the residuals are examined.
+    `alternatives` are the other models that a diagnosis could not tell apart from this one: the calibration of the fit
+    is the mean over all of them. `clipped` are the rows that the fit left out as outliers, None if it was not asked to
     (`outliers.clipped`).
 
     >>> result.value("pupil.magnification")[0].__round__(2)
     15.67
     >>> table = result.to_table()
     """
+
+    _working = ("of", "with_verdict", "with_remark", "with_doubt", "checked_verdict")
 
     likelihood: Likelihood
     values: Vector
@@ -112,7 +112,7 @@ class FitResult(Fitted):
 
     @property
     def calset(self) -> CalibrationSet:
-        """The set that it was fitted to."""
+        """The calibration set that was fitted."""
         return self.likelihood.calset
 
     @property
@@ -169,7 +169,7 @@ class FitResult(Fitted):
             if p.free and p.prior is not None and abs(value - p.prior[0]) > PRIOR_EDGE * p.prior[1]
         )
 
-    def judged(
+    def with_verdict(
         self,
         doubts: Sequence[str] = (),
         *,
@@ -177,11 +177,11 @@ class FitResult(Fitted):
         structure: Structure = NO_STRUCTURE,
         remedies: Sequence[str] = (),
     ) -> FitResult:
-        """The fit with the verdict on it, given the sentences that its residuals hold against it.
+        """The fit with the verdict on it; `doubts` are the sentences that its residuals hold against it.
 
         `noiseless` data are expected counts, those of a plan: they may scatter less than their errors. `structure` is
-        what its field points differ by. `remedies` are what would explain data that the model does not, the best
-        first: sentences that take the place of the advice to look for missing effects.
+        what its field points differ by beyond the model. `remedies` are what would explain data that the model does
+        not, the best first: sentences that take the place of the advice to look for missing effects.
         """
         verdict = Verdict(
             chi2=self.chi2,
@@ -189,21 +189,21 @@ class FitResult(Fitted):
             n_data=self.n_data,
             noise_scale=self.noise_scale,
             converged=self.converged,
-            against=tuple(_against(self, doubts, examined=True, noiseless=noiseless, remedies=remedies)),
+            doubts=tuple(_doubts(self, doubts, examined=True, noiseless=noiseless, remedies=remedies)),
             errors_from=self.errors_from,
             structure=structure,
         )
         return dataclasses.replace(self, verdict=verdict)
 
-    def remarked(self, sentence: str) -> FitResult:
-        """The fit with a remark in its verdict, which forbids nothing."""
-        return self.doubted(Quality(0), sentence)
+    def with_remark(self, sentence: str) -> FitResult:
+        """The fit with one more sentence in its verdict, which forbids nothing."""
+        return self.with_doubt(Quality(0), sentence)
 
-    def doubted(self, bit: Quality, sentence: str) -> FitResult:
-        """The fit with one more thing against it, which forbids trust unless it has no bit."""
+    def with_doubt(self, bit: Quality, sentence: str) -> FitResult:
+        """The fit with one more doubt in its verdict; it forbids trust unless `bit` is 0."""
         verdict = self.checked_verdict()
-        against = (*verdict.against, Doubt(bit, sentence, blocking=bool(bit)))
-        return dataclasses.replace(self, verdict=dataclasses.replace(verdict, against=against))
+        against = (*verdict.doubts, Doubt(bit, sentence, blocking=bool(bit)))
+        return dataclasses.replace(self, verdict=dataclasses.replace(verdict, doubts=against))
 
     def checked_verdict(self) -> Verdict:
         """The verdict; raises RuntimeError for a fit without one."""
@@ -222,7 +222,7 @@ class FitResult(Fitted):
         """The sentences of the verdict; of a fit that was not examined, those on χ², priors and convergence."""
         if self.verdict is not None:
             return self.verdict.warnings
-        doubts = _against(self, (), examined=False, noiseless=False)
+        doubts = _doubts(self, (), examined=False, noiseless=False)
         return tuple(doubt.sentence for doubt in doubts if doubt.sentence)
 
     def residuals(self) -> Float[np.ndarray, "p e k"]:
@@ -234,7 +234,7 @@ class FitResult(Fitted):
         return self.likelihood.residuals(self.values)[1]
 
     def value(self, name: str) -> tuple[float, float]:
-        """Value and standard error of a parameter."""
+        """Value and standard error of a parameter, in its unit."""
         return self[name][:2]
 
     def to_arviz(self, draws: int = 1000, seed: int = 0) -> Any:
@@ -246,7 +246,9 @@ class FitResult(Fitted):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on parameters missing in its table, on unconstrained ones, and on undetectable mistakes."""
+        """Sentences on parameters missing in its table, on unconstrained ones, and on errors that the data would not
+        show.
+        """
         notes = parameter_notes(self.model, self.sigma)
         if self.hidden is None or not len(self.hidden):
             return notes
@@ -283,15 +285,15 @@ def fit(
     *,
     start: Vector | None = None,
     noise_scale: float | None = None,
-    worth: float | None = None,
+    target_objective: float | None = None,
 ) -> FitResult:
     """Maximise a likelihood with its priors, from the start values of the model or `start` (a full vector).
 
     A model whose χ²/dof stays above `search.FAR_OFF` would be bent out of all physical shape: priors mean nothing
     beside such residuals. The errors of the data are then scaled until χ²/dof is 1, the minimum is sought again, from
     plates one order of retardance away as well, and the result says so (`noise_scale`, `warnings`). A `noise_scale`
-    that is given is kept, with no other start: so that fits can be compared; `worth` is the objective of the other
-    fit, and a search that has not come below it when it should have converged is given up.
+    that is given is kept, with no other start, so that fits can be compared. `target_objective` is the objective of the
+    fit with which this one is compared: a search that has not come below it when it should have converged is given up.
     The minimum of a large set (`Layout.large`) is sought on a sample of its points; a pass over all of them gives
     the step from there to its own, and another one shows that nothing is left to do.
     Raises ValueError when the exposures cannot determine the instrument.
@@ -300,14 +302,14 @@ def fit(
     first = likelihood.model.start if start is None else np.asarray(start, float)
     # Where errors of the data have parameters, the instrument is sought first, with errors held.
     likelihood = likelihood.with_errors_at(first)
-    best = find_minimum(likelihood, first, noise_scale, worth)
+    best = find_minimum(likelihood, first, noise_scale, target_objective)
     for _ in range(LAYOUTS):
         # Retarders that a fit has made thicker need more wavelengths than those that it began with.
         before, likelihood = likelihood, likelihood.following(best.x)
         if likelihood is before:
             break
         likelihood = likelihood.with_errors_at(first)
-        best = find_minimum(likelihood, best.x, noise_scale, worth)
+        best = find_minimum(likelihood, best.x, noise_scale, target_objective)
     if likelihood.model.template.noise is not None:
         best = with_errors_fitted(likelihood, best, first, noise_scale or 1.0)
     return fit_at(likelihood, best, time.perf_counter() - began)
@@ -322,7 +324,7 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
     if idle := [model.parameters[i].name for i in model.free[np.diag(best.expansion.matrix) == 0.0]]:
         what = f"nothing in the data depends on {', '.join(idle)}, free and without a prior"
         them = "it" if len(idle) == 1 else "them"
-        raise ValueError(f"{what}: freeze {them} or set a prior in the model file")
+        raise ValueError(f"{what}: fix {them} (free = false) or set a prior in the model file")
     return FitResult(
         likelihood=likelihood.with_errors_at(best.x),
         values=best.x,
@@ -333,11 +335,11 @@ def fit_at(likelihood: Likelihood, best: Minimum[Expansion], seconds: float) -> 
     )
 
 
-def with_honest_errors(result: FitResult) -> FitResult:
-    """The fit with errors from its residuals where it does not explain the data (`robust`); as it is where it does.
+def with_empirical_covariance(result: FitResult) -> FitResult:
+    """The fit with a covariance made from its residuals where it does not explain the data (`robust`).
 
-    Only the covariance changes; the verdict is to be made anew. For reported errors: model comparison keeps the stated
-    ones.
+    A fit that explains its data comes back as it is. Only the covariance changes; the verdict is to be made anew. It is
+    for reported errors: model comparison keeps the stated ones.
     """
     if result.explains_data or result.errors_from != STATED or result.dof <= 0 or not result.converged:
         return result
@@ -347,7 +349,7 @@ def with_honest_errors(result: FitResult) -> FitResult:
     return dataclasses.replace(result, covariance=errors, errors_from=made_from, verdict=None)
 
 
-def _against(
+def _doubts(
     result: FitResult,
     doubts: Sequence[str],
     *,
@@ -407,7 +409,7 @@ def _against(
 
 
 def _of_errors(result: FitResult) -> Iterator[str]:
-    """What a fit has found of the errors of its data, in a sentence."""
+    """A sentence with the values of the fitted terms of the errors of the data; none if no term was fitted."""
     fitted = [i for i in result.model.positions(NOISE).tolist() if result.sigma[i] > 0]
     if fitted:
         terms = ", ".join(f"{result.model.names[i]} = {result[result.model.names[i]]}" for i in fitted)
@@ -418,14 +420,14 @@ def refit(
     calset: CalibrationSet,
     model: Model | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
 ) -> FitResult:
     """Fit a calibration set with `model` (default: the base model).
 
-    `progress` is called with a line about each step. Errors are those of `with_honest_errors`. Raises what `fit`
+    `progress` is called with a line about each step. Errors are those of `with_empirical_covariance`. Raises what `fit`
     raises.
     """
     runner = Runner(progress=progress)
     likelihood = Likelihood.of(calset, model or base_model(calset), runner=runner)
     runner.tell(Stage("preparing the fit", "fitting"))
-    return with_honest_errors(fit(likelihood))
+    return with_empirical_covariance(fit(likelihood))

@@ -22,11 +22,11 @@ from jaxtyping import Float, Int
 
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.search import free_scales
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.inverses import root_of
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Expansion, Likelihood, Matrix
-from walop_jax.model.specification import Vector
+from walop_jax.likelihood.likelihood import Expansion, Likelihood
 
 ROBUST_POINTS = 4096
 """Field points whose residuals give the errors of a fit that does not explain its data."""
@@ -109,7 +109,10 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
 
 
 def states(calset: CalibrationSet) -> Int[np.ndarray, " e"]:
-    """Number of the state of every exposure: same time, kind and positions of everything that moves, any filter."""
+    """Number (e) of the state of every exposure.
+
+    Exposures of one state differ in nothing but the filter: same time, KIND and positions of everything that moves.
+    """
     e = calset.exposures
     columns = [e.kind, e.mjd, e.temp, e.rotator]
     columns += [np.where(at.inside, at.angle, np.nan) for at in e.positions.values()]
@@ -122,7 +125,9 @@ def field_cells(calset: CalibrationSet) -> Int[np.ndarray, " p"]:
 
 
 def cut(values: Float[np.ndarray, " p"], count: int) -> Int[np.ndarray, " p"]:
-    """The part, of so many of equal width from the smallest value to the largest, in which each value lies."""
+    """Number (p) of the interval in which each value lies, of `count` intervals of equal width from the smallest value
+    on.
+    """
     return np.minimum((count * (values - values.min()) / (np.ptp(values) or 1.0)).astype(int), count - 1)
 
 

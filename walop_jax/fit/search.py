@@ -15,14 +15,15 @@ import numpy as np
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.layout import thinned
-from walop_jax.likelihood.likelihood import Census, Expansion, Likelihood
+from walop_jax.likelihood.likelihood import Expansion, Likelihood, UsedData
 from walop_jax.model import materials
 from walop_jax.model.noise import NOISE
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 
-Found = Minimum[Expansion]
+FoundMinimum = Minimum[Expansion]
 
 FAR_OFF = 25.0  # χ²/dof above which other orders are tried and the errors scaled
 MAXIMUM_RESCALINGS = 4
@@ -34,7 +35,7 @@ LARGE_TOLERANCE = 1e-3
 
 
 def free_scales(model: Model) -> Vector:
-    """The unit in which a solver thinks of each free parameter."""
+    """The natural step (f) of each free parameter, in which a solver counts."""
     return np.array([model.parameters[i].scale for i in model.free])
 
 
@@ -51,7 +52,7 @@ def _search(
     near: Expansion | None = None,
     maximum_steps: int = MAXIMUM_STEPS,
     **how: Any,
-) -> Found:
+) -> FoundMinimum:
     """The minimum from a full vector of start values, its `x` full as well; `near` is an expansion at similar ones.
 
     `how` goes to `minimise`.
@@ -78,19 +79,23 @@ def _search(
     return dataclasses.replace(minimum, x=model.full(minimum.x, first))
 
 
-def nearer(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
-    """Values that are no more than a distance (standard errors, all parameters together) from the minimum.
+def moved_within(likelihood: Likelihood, values: Vector, distance: float) -> Vector:
+    """Values (n) that lie within `distance` of the minimum, in standard errors of all parameters together.
 
-    They are `values` themselves where these are; the closest that a few steps reach where there is no such place.
+    `values` come back as they are if they lie within it. If no values within it are reached, the closest come back that
+    a few steps lead to.
     """
     how = {"maximum_steps": FIRST_STEPS, "tolerance": distance}
     return _search(likelihood, "closer to the data", values, 1.0, **how).x
 
 
-def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise_scale: float) -> Found:
-    """The minimum in the parameters of the errors as well, from that with errors held at the start values `first`.
+def with_errors_fitted(
+    likelihood: Likelihood, best: FoundMinimum, first: Vector, noise_scale: float
+) -> FoundMinimum:
+    """The minimum in all parameters, those of the errors of the data included.
 
-    Scales begin where they would make χ²/dof of the residuals 1.
+    `best` is the minimum with these errors held at the start values `first`. Scales begin where they would make χ²/dof
+    of the residuals 1.
     """
     model, expansion, start = likelihood.model, best.expansion, best.x.copy()
     noise, at = model.template.noise, model.positions(NOISE)
@@ -106,7 +111,7 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
     unit = free_scales(model)
     inverse = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), rcond=1e-15, hermitian=True)
     taken_up = float(np.sum(inverse * of_data * np.outer(unit, unit)))
-    data = float(expansion.census.rows @ likelihood.data_per_row)
+    data = float(expansion.used_data.rows @ likelihood.data_per_row)
     live = dataclasses.replace(likelihood.with_errors_at(None), left=1.0 - taken_up / max(data, 1.0))
     found = _search(
         live, "fit with errors of the data", model.full(start[model.free], start), noise_scale, expansion
@@ -115,26 +120,26 @@ def with_errors_fitted(likelihood: Likelihood, best: Found, first: Vector, noise
 
 
 def find_minimum(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> Found:
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
+) -> FoundMinimum:
     """The minimum of a set from start values that may be far away; of a large one, from that of a sample of it.
 
-    The sample of a very large set is large itself. `noise_scale` and `worth` are those of `refit.fit`. Raises
-    `DataError` when the exposures cannot determine the instrument.
+    The sample of a very large set is large itself. `noise_scale` and `target_objective` as for `refit.fit`.
+    Raises `DataError` when the exposures cannot determine the instrument.
     """
     layout = likelihood.layout
     if not layout.large:
-        return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, worth))
+        return _best_gaps(likelihood, _from_afar(likelihood, first, noise_scale, target_objective))
     sample_set = thinned(likelihood.calset, max(limits.SAMPLE, layout.points // limits.FARTHEST))
     sample = Likelihood.of(sample_set, likelihood.model, runner=likelihood.runner)
     sample = sample.with_errors_at(likelihood.errors_at)
-    best = find_minimum(sample, first, noise_scale, worth)
+    best = find_minimum(sample, first, noise_scale, target_objective)
     scale = best.expansion.noise_scale
     found = _search(likelihood, "fit of all points", best.x, scale, tolerance=LARGE_TOLERANCE, damping=0.0)
     return dataclasses.replace(found, starts=best.starts)
 
 
-def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
+def _best_gaps(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
     """The lowest minimum with air gaps some orders of their fringes thicker or thinner.
 
     Fringes of gaps a quarter of a wavelength apart differ by their sign, within a narrow band: each is a minimum of its
@@ -161,14 +166,18 @@ def _best_gaps(likelihood: Likelihood, best: Found) -> Found:
 
 
 def _from_afar(
-    likelihood: Likelihood, first: Vector, noise_scale: float | None, worth: float | None
-) -> Found:
-    """The minimum from start values that may be far away, the errors of the data scaled if need be."""
+    likelihood: Likelihood, first: Vector, noise_scale: float | None, target_objective: float | None
+) -> FoundMinimum:
+    """The minimum of a search from start values that may be far away; if the model is poor, `_far_off` takes over."""
     check_identifiable(likelihood)
     scale = noise_scale or 1.0
     best = _search(likelihood, "fit", first, scale, maximum_steps=FIRST_STEPS)
-    promising = best.expansion.objective < worth if worth is not None else best.expansion.misfit < FAR_OFF
-    if not best.converged and promising:
+    improving = (
+        best.expansion.objective < target_objective
+        if target_objective is not None
+        else best.expansion.misfit < FAR_OFF
+    )
+    if not best.converged and improving:
         how = {"damping": 0.0, "secant": True}
         best = _search(likelihood, "fit, continued", best.x, scale, best.expansion, **how)
     if noise_scale is not None or best.expansion.misfit < FAR_OFF:
@@ -176,18 +185,20 @@ def _from_afar(
     return _far_off(likelihood, best)
 
 
-def _far_off(likelihood: Likelihood, best: Found) -> Found:
-    """The best minimum of a model far from its data: errors scaled to the residuals, plates a wave off tried."""
+def _far_off(likelihood: Likelihood, best: FoundMinimum) -> FoundMinimum:
+    """The best minimum of a model that does not fit: errors scaled to the residuals, and plates tried a wave thicker or
+    thinner.
+    """
     budget, starts = most_passes(likelihood.model) - best.steps, 1
 
-    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> Found:
+    def search(label: str, values: Vector, scale: float, maximum_steps: int) -> FoundMinimum:
         nonlocal budget
         maximum_steps = max(1, min(maximum_steps, budget))
         attempt = _search(likelihood, label, values, scale, best.expansion, maximum_steps=maximum_steps)
         budget -= attempt.steps
         return attempt
 
-    def rescaled(best: Found) -> Found:
+    def rescaled(best: FoundMinimum) -> FoundMinimum:
         for _ in range(MAXIMUM_RESCALINGS):
             scale = float(np.sqrt(best.expansion.misfit)) if best.expansion.misfit > FAR_OFF else 1.0
             if budget <= 0 or abs(scale / best.expansion.noise_scale - 1.0) < 0.1:
@@ -219,12 +230,12 @@ def _far_off(likelihood: Likelihood, best: Found) -> Found:
     return dataclasses.replace(best, starts=starts)
 
 
-def check_identifiable(likelihood: Likelihood, census: Census | None = None) -> None:
+def check_identifiable(likelihood: Likelihood, used_data: UsedData | None = None) -> None:
     """Raise `DataError` when the exposures cannot determine an instrument at all.
 
-    `census` is that of its points, where it is at hand: else they are counted.
+    `used_data` says which data of the set are used, if the caller has counted them already; else they are counted here.
     """
-    rows = (likelihood.census if census is None else census).rows
+    rows = (likelihood.used_data if used_data is None else used_data).rows
     e, inputs = likelihood.calset.exposures, ", ".join(str(entry.path) for entry in likelihood.calset.inputs)
     polariser = likelihood.model.template.polariser is not None
     through = (e.clp_in | (not polariser)) & (rows > 0)

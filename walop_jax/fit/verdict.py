@@ -85,10 +85,11 @@ REMEDIES: Mapping[Quality, str] = {
 
 @dataclasses.dataclass(frozen=True)
 class Doubt:
-    """A doubt: a bit of `Quality`, a sentence for the user, whether it forbids trust, its effect and its remedy.
+    """One thing that a verdict holds against a result: a sentence, whether it forbids trust, its size, its remedy.
 
-    One that forbids nothing is a reservation; without a bit it is a remark. `off` is by how much it makes q or u of
-    stars wrong, or uncertain, as a fraction (None: not known).
+    `bit` is its bit in QUALITY. A doubt that is not `blocking` is a reservation; without a bit it is a remark. `off` is
+    by how much it makes q or u of stars wrong, or uncertain, as a fraction (0.001 is 0.1 %; None: not known). Example:
+    "the model does not explain the data: χ²/dof = 3, where 1 is expected".
     """
 
     bit: Quality
@@ -132,9 +133,9 @@ class Doubt:
 class Structure:
     """Differences between field points that are finer than the model, rms over points and cameras.
 
-    `gain` is that of the gain of a camera (a share of its counts), `response` that of its response to fully polarised
-    light (a share of the counts as well); 0 where residuals show none. Standard errors of everything that is seen at
-    one place of the field hold them: no average over exposures makes them smaller.
+    `gain` is the rms of the gain of a camera, as a fraction of its counts; `response` the rms of its response to fully
+    polarised light, as a fraction of the counts as well; both are 0 where the residuals show none. Standard errors of
+    everything that is seen at one place of the field hold them: no average over exposures makes them smaller.
     """
 
     gain: float = 0.0
@@ -148,18 +149,21 @@ NO_STRUCTURE = Structure()
 NOT_MEASURED = (
     "the calibration data hold no information on {}; Q_HIDDEN, U_HIDDEN of stars have it, Q_ERR, U_ERR do not"
 )
-"""Remark on mistakes without information in the data, at their usual sizes."""
+"""Remark on errors on which the data hold no information, at their usual sizes."""
 EFFECT, DATA = "effect", "data"
-"""Kinds of mistakes that could hide: of the model of the instrument, of numbers that the set states."""
+"""Kinds of undetected errors: of the model of the instrument, of numbers that the set states."""
 
 
-class Mistake(NamedTuple):
-    """A mistake that the data would not show.
+class UndetectedError(NamedTuple):
+    """A systematic error that the data would not show: of the model of the instrument, or of a number that the set
+    states.
 
-    Its `size` in `unit` would just have been found, or is the largest plausible one. `kind` is `EFFECT` or `DATA`,
-    `remedy` a measurement that would show it. What acts on starlight itself is an effect that the model has not: `acts`
-    holds it at its size, as JSON of name and values, "" for all others. It is not `measured` where the data hold no
-    information on it at all.
+    At `size`, in `unit`, it would just have been found, or it is the largest that is plausible. `kind` is `EFFECT` or
+    `DATA`, `remedy` a measurement that would show it. An effect that acts on starlight itself and that the model has
+    not is held by `acts` at its size, as JSON of name and values; `acts` is "" for all others. `measured` is False
+    where the data hold no information on it at all.
+
+    Example: an error of the angles of the standards (size 0.3, unit deg, kind DATA).
     """
 
     name: str
@@ -173,30 +177,30 @@ class Mistake(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hidden:
-    """Single mistakes that the data would not show.
+    """The systematic errors that the data would not show, each one by itself.
 
-    `changes` are what each does to the parameters of the model, all of them in tree order. The largest effect of any of
-    them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
+    `changes` (s, n) are what each of them does to the parameters of the model, in tree order. The largest effect of any
+    of them on a star is the protection level of its Stokes parameters (RAIM: National Academies 4920, 2023).
     """
 
-    mistakes: tuple[Mistake, ...]
+    errors: tuple[UndetectedError, ...]
     changes: Float[np.ndarray, "s n"]
 
     def __len__(self) -> int:
-        return len(self.mistakes)
+        return len(self.errors)
 
     def not_measured(self) -> tuple[str, ...]:
-        """Names of all unmeasured mistakes, each with the measurement to take."""
+        """Names of the errors on which the data hold no information, each with the measurement to take."""
         together: dict[str, list[str]] = {}
-        for mistake in self.mistakes:
-            if not mistake.measured:
-                together.setdefault(mistake.remedy, []).append(mistake.name)
+        for error in self.errors:
+            if not error.measured:
+                together.setdefault(error.remedy, []).append(error.name)
         joined = {", ".join(names): remedy for remedy, names in together.items()}
         return tuple(f"{names} (to measure it: {cure})" if cure else names for names, cure in joined.items())
 
     def in_words(self, most: int = 1) -> str:
-        """The worst of them in a sentence."""
-        sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.mistakes]
+        """A sentence on the worst of them, `most` by name."""
+        sizes = [f"{m.name} of {rounded(m.size, '.2g')} {m.unit}".rstrip() for m in self.errors]
         return f"too small to be detected, yet larger than the errors: {some(sizes, most)}"
 
 
@@ -216,7 +220,7 @@ class VerdictPart(NamedTuple):
 class Verdict(Displayed):
     """The verdict on `subject`: all doubts about it, and statistics where it is a fit.
 
-    The one rule of trust: a result is trusted, and a go, if none of the doubts `against` it is blocking. `stars` says
+    The one rule of trust: a result is trusted, and a go, if none of its `doubts` is blocking. `stars` says
     how well p of a star is known with it. `parts` are the results that the doubts were read off, by name.
 
     Of a fit: `noise_scale` multiplied the errors of the data (1: as given); `structure` is what field points differ by;
@@ -224,12 +228,14 @@ class Verdict(Displayed):
     the stated errors of the data, or the residuals (`fit.robust`).
     """
 
+    _working = ("recorded", "with_doubts", "on_top_of", "answers", "first_facts")
+
     chi2: float = float("nan")
     dof: int = 0
     n_data: int = 0
     noise_scale: float = 1.0
     converged: bool = True
-    against: tuple[Doubt, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     covariance_from: str = "fit"
     errors_from: str = STATED
     structure: Structure = NO_STRUCTURE
@@ -239,15 +245,16 @@ class Verdict(Displayed):
 
     @classmethod
     def recorded(cls, *, trusted: bool, quality: int, warnings: Sequence[str] = (), **others: Any) -> Verdict:
-        """The verdict that a file states, which relates no sentence to a bit: all bits are those of the first one.
+        """The verdict that a file states.
 
-        Of a fit that is not trusted that is the first reason against it.
+        A file does not say which sentence belongs to which bit: all bits go to the first doubt. If the fit is not
+        trusted, the first sentence is the reason.
         """
         said = [*warnings]
         bits = Quality(quality)
         first = (Doubt(bits, said.pop(0) if said and not trusted else "", blocking=not trusted),)
         remarks = tuple(Doubt(Quality(0), text, blocking=False) for text in said)
-        return cls(**others, against=(*(first if quality or not trusted else ()), *remarks))
+        return cls(**others, doubts=(*(first if quality or not trusted else ()), *remarks))
 
     def with_doubts(
         self,
@@ -257,14 +264,14 @@ class Verdict(Displayed):
         stars: str = "",
         parts: Mapping[str, VerdictPart] | None = None,
     ) -> Verdict:
-        """The verdict with more against it, each sentence once."""
-        against, said = [*self.against], {doubt.sentence for doubt in self.against}
+        """The verdict with further doubts, each sentence once."""
+        kept, said = [*self.doubts], {doubt.sentence for doubt in self.doubts}
         for doubt in doubts:
             if doubt.sentence not in said or not doubt.sentence:
-                against.append(doubt)
+                kept.append(doubt)
             said.add(doubt.sentence)
         return dataclasses.replace(
-            self, against=tuple(against), subject=subject or self.subject, stars=stars or self.stars,
+            self, doubts=tuple(kept), subject=subject or self.subject, stars=stars or self.stars,
             parts={**self.parts, **(parts or {})},
         )  # fmt: skip
 
@@ -277,33 +284,33 @@ class Verdict(Displayed):
     @property
     def trusted(self) -> bool:
         """True if no doubt forbids the use."""
-        return not any(doubt.blocking for doubt in self.against)
+        return not any(doubt.blocking for doubt in self.doubts)
 
     @property
     def go(self) -> bool:
-        """The same, as the answer to the question whether it can be used for stars."""
+        """True if the result can be used for stars: the same as `trusted`."""
         return self.trusted
 
     @property
     def quality(self) -> Quality:
         """The bits of all doubts."""
-        return functools.reduce(operator.or_, (doubt.bit for doubt in self.against), Quality(0))
+        return functools.reduce(operator.or_, (doubt.bit for doubt in self.doubts), Quality(0))
 
     @property
     def reasons(self) -> tuple[Doubt, ...]:
         """All doubts that say something, the one that does most to q and u of stars first."""
-        told = [doubt for doubt in self.against if doubt.blocking or doubt.sentence]
+        told = [doubt for doubt in self.doubts if doubt.blocking or doubt.sentence]
         return tuple(sorted(told, key=lambda doubt: doubt._rank))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts and remarks in sentences."""
-        return tuple(doubt.sentence for doubt in self.against if doubt.sentence)
+        return tuple(doubt.sentence for doubt in self.doubts if doubt.sentence)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def residual_doubts(self) -> tuple[str, ...]:
         """The sentences about the residuals alone (`Quality.DOUBTED`)."""
-        return tuple(d.sentence for d in self.against if d.bit & Quality.DOUBTED and d.sentence)
+        return tuple(d.sentence for d in self.doubts if d.bit & Quality.DOUBTED and d.sentence)
 
     @property
     def objections(self) -> tuple[str, ...]:
@@ -329,7 +336,7 @@ class Verdict(Displayed):
 
     @property
     def first_facts(self) -> tuple[tuple[str, str], ...]:
-        """The lines below: what it means for p of a star, and all further reasons."""
+        """The lines below the first: what the verdict means for p of a star, and all further reasons."""
         others = [f"{doubt.words}" for doubt in self.reasons[1:]] or ["nothing else"]
         unknown = "not known" if self.trusted else "not known: it is not to be used"
         return ("p of a star", self.stars or unknown), *zip(

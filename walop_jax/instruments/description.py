@@ -1,8 +1,8 @@
 """Description files of instruments (TOML): elements with their numbers, arms, cameras, site and field.
 
-A file may stand on another one (`like = NAME`) and say only what differs: tables are merged key by key, layers of a
-plate by their name, everything else is replaced. What elements and arms may say, the model knows that builds them
-(`model.build`).
+A file may be based on another one (`like = NAME`) and say only what differs: tables are merged key by key, layers of a
+plate by their name, and everything else is replaced. Which entries elements and arms may have is known to the model
+that builds them (`model.build`).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ NO_SOURCE = "description file"  # of numbers, where a file names none
 class Description:
     """An instrument as described; `path` names the elements ahead of the arms in the order light meets them.
 
-    `elements` and `arms` are their tables, which the model reads that builds them, as `read` does; `field_limit`,
-    `field_scale` and `edge` in degrees; `wavelength` (µm) is where colours are counted from, None: where WALOP's are;
-    `degree`, `level`, `scale` and `loose` of the throughput; `split` and `floor`
-    as in `model.cameras.Cameras`; `raster` is how the field points of a simulated run lie.
+    `elements` and `arms` are their tables, read by the model that builds them, with `read`; `field_limit`,
+    `field_scale` and `edge` are in degrees; `wavelength` (µm) is the wavelength from which colours are counted (None:
+    as for WALOP); `degree`, `level`, `scale` and `loose` belong to the throughput; `split` and `floor` are as `split`
+    and `noise_floor` of `model.cameras.Cameras`; `raster` says how the field points of a simulated run lie.
     """
 
     name: str
@@ -81,7 +81,7 @@ def shipped() -> tuple[str, ...]:
 
 @functools.cache
 def default_name() -> str:
-    """The shipped instrument that is meant where none is named."""
+    """The shipped instrument that is used where none is named."""
     return next(name for name in shipped() if described(name).default)
 
 
@@ -185,7 +185,7 @@ def _description(read: Reader, table: Table, text: str) -> Description:
     if not 0 <= degree <= 12:
         raise read.fault("throughput", f"degree = {degree!r} must be a whole number from 0 to 12")
     if not 0.0 <= floor < 1.0:
-        raise read.fault("cameras", f"floor = {floor:g} must be a share of the light from 0 to below 1")
+        raise read.fault("cameras", f"floor = {floor:g} must be a fraction of the light from 0 to below 1")
     raster = field.get("raster", RASTERS[0])
     if raster not in RASTERS:
         raise read.fault("field", f"raster = {raster!r} must be {' or '.join(RASTERS)}")

@@ -51,7 +51,7 @@ def run_file(path: PathLike, advice: str) -> ModuleType:
 
 
 def files_of_users() -> tuple[str, ...]:
-    """Absolute paths of the Python files of users that were run: another process must run them before it unpickles."""
+    """Absolute paths of the Python files of users that were run; another process must run them before it unpickles."""
     modules = [
         getattr(module, "__file__", None)
         for name, module in sys.modules.items()
@@ -61,9 +61,10 @@ def files_of_users() -> tuple[str, ...]:
 
 
 def blank(kind: type[T]) -> T:
-    """An object without its fields, for `__reduce__`: float64 is on before its arrays are read, which would lose half.
+    """An object without its fields, for `__reduce__`.
 
-    Whoever unpickles a result may not have asked the package for anything yet.
+    It switches float64 on before the arrays of the object are read, which would lose half of their digits otherwise:
+    whoever unpickles a result may not have asked the package for anything yet.
     """
     importlib.import_module("walop_jax")._switch_on_float64()
     return object.__new__(kind)

@@ -52,12 +52,12 @@ class Display:
         yield from (f"  {note}" for note in self.notes)
 
     def document(self) -> dict[str, Any]:
-        """The same as plain data."""
+        """The display as plain data."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Display:
-        """The display that such a document was made of. Raises KeyError or TypeError for one that is none."""
+        """The display that a `document` was made of. Raises KeyError or TypeError for any other document."""
         return cls(
             str(document["title"]),
             tuple((str(name), str(words)) for name, words in document["facts"]),
@@ -67,7 +67,7 @@ class Display:
         )
 
     def without(self, gone: Collection[str]) -> Display:
-        """The same without the facts of these names; lines without a name go with the one above."""
+        """The display without the facts of these names; a line without a name goes with the line above it."""
         facts, dropped = [], False
         for name, text in self.facts:
             dropped = name in gone if name else dropped
@@ -76,7 +76,7 @@ class Display:
         return dataclasses.replace(self, facts=tuple(facts))
 
     def shortened(self, most: int) -> Display:
-        """The same in at most `most` lines: rows of the table go, and it is said how many."""
+        """The display in at most `most` lines: rows of the table are left out, and it says how many."""
         room = most - 3 - len(self.facts) - len(self.notes)
         if len(self.rows) <= room + 1:
             return self
@@ -113,7 +113,17 @@ def _cell(tag: str, text: str, column: str = "") -> str:
 
 
 class Displayed(abc.ABC):
-    """Something that shows itself as a short table instead of as everything that it holds."""
+    """Something that shows itself as a short table instead of as everything that it holds.
+
+    `_working` are methods by which other rooms make and change it. They are no results: `dir` leaves them out, and with
+    it the completion of names in a session.
+    """
+
+    _working: ClassVar[tuple[str, ...]] = ()
+
+    def __dir__(self) -> list[str]:
+        working = {name for cls in type(self).__mro__ for name in vars(cls).get("_working", ())}
+        return sorted(set(super().__dir__()) - working)
 
     @abc.abstractmethod
     def display(self) -> Display:
@@ -136,20 +146,23 @@ class Displayed(abc.ABC):
 class Drawn(Displayed):
     """Something of which there are figures; the class says which one to begin with."""
 
-    first_figure: ClassVar[str]
+    _first_figure: ClassVar[str]
 
     def plot(self, name: str | None = None, **options: Any) -> Any:
-        """One of its figures by name; `walop_jax.plot(self)` lists them, and `options` are its."""
-        return importlib.import_module("walop_jax").plot(self, name or self.first_figure, **options)
+        """Draw one of its figures, given by name (default: the first one).
+
+        `walop_jax.plot(self)` lists the names; `options` are the options of `walop_jax.plot`.
+        """
+        return importlib.import_module("walop_jax").plot(self, name or self._first_figure, **options)
 
 
 class Result(Drawn):
     """Base class of results with a calibration, which the public functions take."""
 
-    first_figure = "matrix"
+    _first_figure = "matrix"
 
     def report(self, output: PathLike, **options: Any) -> Any:
-        """Write the page about it."""
+        """Write the HTML page about it."""
         return importlib.import_module("walop_jax").report(self, output, **options)
 
     def save(self, folder: PathLike, *, overwrite: bool = False) -> None:

@@ -64,10 +64,10 @@ def rows_text(rows: Sequence[int] | np.ndarray) -> str:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """Advise on a name that does not exist: the names most like it, or some of those that there are.
+    """Advice on a name that does not exist: the names most like it, or some of the names that there are.
 
-    Of a mapping the values are the meanings of the names: where none is much like it, those are taken that have a word
-    of it.
+    The values of a mapping are the meanings of its names: where no name is much like it, names whose meaning has a word
+    of it are taken.
     """
     meanings = names if isinstance(names, Mapping) else {}
     names = sorted(set(names))

@@ -145,7 +145,7 @@ def _verify(path: Path, hdus: list[Any], stream: io.BufferedIOBase) -> str:
     digest = hashlib.sha256()
     for number, hdu in enumerate(hdus):
         info = hdu.fileinfo() if hasattr(hdu, "fileinfo") else None
-        if info is None:  # astropy's stand-in for an extension whose header it cannot understand
+        if info is None:  # astropy puts None in the place of an extension whose header it cannot understand
             raise fail(f"the header of extension {number} is damaged", file=path, advice=BROKEN)
         name = hdu.name or f"HDU {number}"
         start, data, end = info["hdrLoc"], info["datLoc"], info["datLoc"] + info["datSpan"]

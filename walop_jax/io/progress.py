@@ -1,8 +1,10 @@
-"""While compiled code keeps the main thread busy, for many seconds at times: progress is repeated, Ctrl-C answered.
+"""Progress is repeated and Ctrl-C is answered while compiled code keeps the main thread busy, for many seconds at
+times.
 
 Python tells its main thread of a signal between two of its own instructions; compiling a program or decomposing a large
-matrix is one. So a second thread is notified as well (`signal.set_wakeup_fd`), and ends the process where the main
-thread has not by then. Files are written beside their place and moved there when whole: nothing is half-written.
+matrix is one instruction. So a second thread is notified as well (`signal.set_wakeup_fd`), and ends the process where
+the main thread has not by then. Files are written beside their place and moved there when whole: nothing is
+half-written.
 """
 
 from __future__ import annotations

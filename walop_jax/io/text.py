@@ -105,18 +105,18 @@ def beside(value: float, limit: float, form: str = "#.{}g") -> tuple[str, str]:
 
 
 NOISE = 1e-8
-"""Share below which an effect on q, u or p is rounding noise of float64 optics, and no result."""
+"""Fraction below which an effect on q, u or p is rounding noise of float64 optics, and no result."""
 
 
-def per_cent(share: float | None) -> str:
-    """A share in per cent to two digits, without the sign: 0.23; `< 10⁻⁶` for what is rounding noise."""
-    if share is not None and 0.0 < abs(share) < NOISE:
+def per_cent(fraction: float | None) -> str:
+    """A fraction in per cent to two digits, without the sign: 0.23; `< 10⁻⁶` for what is rounding noise."""
+    if fraction is not None and 0.0 < abs(fraction) < NOISE:
         return f"< 10{str(round(math.log10(100.0 * NOISE))).translate(RAISED)}"
-    return two_digits(None if share is None else 100.0 * share)
+    return two_digits(None if fraction is None else 100.0 * fraction)
 
 
 def per_cent_range(low: float, high: float) -> str:
-    """As `two_digits_range` of shares, in per cent."""
+    """A range of fractions in per cent, as `two_digits_range` writes it."""
     if not math.isfinite(low):
         return ""
     if low < NOISE:

@@ -37,7 +37,7 @@ class Reader:
                 raise self.fault(place, f"there is no key {key!r}; {nearest(key, keys)}")
 
     def table(self, value: Any, place: str, what: str = "") -> Table:
-        """A table."""
+        """A table of the file; `DataError` for anything else."""
         if not isinstance(value, Mapping):
             raise self.fault(place, f"{what}{value!r} must be a table")
         return value
@@ -49,7 +49,7 @@ class Reader:
         return value
 
     def words(self, value: Any, key: str, place: str) -> tuple[str, ...]:
-        """Names, each once."""
+        """A list of names, each of which occurs once."""
         if not (isinstance(value, list) and value and all(isinstance(word, str) for word in value)):
             raise self.fault(place, f"{key} = {value!r} must be a list of names")
         if len(set(value)) != len(value):
@@ -63,7 +63,7 @@ class Reader:
         return value
 
     def number(self, value: Any, key: str, place: str) -> float:
-        """A finite number."""
+        """A finite number; `DataError` for anything else."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
             shown = repr(value) if len(repr(value)) < 80 else "that"
             kind = "one number" if isinstance(value, list) else "a finite number"
@@ -77,20 +77,20 @@ class Reader:
         return tuple(self.number(entry, f"{key}[{i}]", place) for i, entry in enumerate(value))
 
     def positive(self, value: Any, key: str, place: str, advice: str = "") -> float:
-        """A number above 0."""
+        """A number above 0; `DataError`, with `advice`, for anything else."""
         number = self.number(value, key, place)
         if number <= 0:
             raise self.fault(place, f"{key} = {number:g} must be above 0{advice}")
         return number
 
     def flag(self, value: Any, key: str, place: str) -> bool:
-        """True or false."""
+        """A truth value; `DataError` for anything else."""
         if not isinstance(value, bool):
             raise self.fault(place, f"{key} = {value!r} must be true or false")
         return value
 
     def whole(self, value: Any, key: str, place: str) -> int:
-        """A whole number."""
+        """A whole number; `DataError` for anything else."""
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.fault(place, f"{key} = {value!r} must be a whole number")
         return value

@@ -25,18 +25,19 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.engine import (
     PointData,
     best_flux,
     counts_and_slope,
+    detected_counts,
+    flux_groups,
     point_prediction,
-    real_counts,
-    sharing,
 )
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.layout import median_over_field
-from walop_jax.likelihood.likelihood import Likelihood, Vector, used_rows
+from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
@@ -50,9 +51,9 @@ from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
-from walop_jax.model.sources import ExposureArrays, Sight
+from walop_jax.model.sources import ExposureArrays, PointIllumination
 
-Change = Sequence[tuple[float, Sentence]]
+SumOfSentences = Sequence[tuple[float, Sentence]]
 """A sum of sentences with their coefficients."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
@@ -61,7 +62,9 @@ CAMERAS = ("counts", "opposite", *ADDED)
 GAPS_TOGETHER = 10  # thicknesses of air whose fringes are computed together, in one program for any number
 
 
-def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
+def columns(
+    likelihood: Likelihood, values: Vector, changes: Sequence[SumOfSentences]
+) -> Float[np.ndarray, "d a"]:
     """Derivatives of the used residuals (rows) with respect to the amplitudes of changes, at neutral.
 
     `values` are all parameters of the model. Raises `NoSlotError` for a sentence that has no slots.
@@ -72,7 +75,10 @@ def columns(likelihood: Likelihood, values: Vector, changes: Sequence[Change]) -
 def own_columns(
     likelihood: Likelihood, values: Vector, effects: Sequence[Effect]
 ) -> Float[np.ndarray, "d a"]:
-    """The same for effects of a user's own, by differentiation; those that differ in numbers alone share a program."""
+    """The same derivatives for effects of a user's own, by differentiation of their `patch`.
+
+    Effects that differ in their numbers alone use one program.
+    """
     columns, plans = [], {}
     for effect in effects:
         structure = jax.tree.structure(effect)
@@ -95,14 +101,14 @@ def _own_at_point(
 
     def counts(amplitudes: list[Float[Array, ...]]) -> Float[Array, "e k"]:
         active = put(amplitudes)
-        return real_counts(active, plan, point_prediction(active, plan, point), flux, point)
+        return detected_counts(active, plan, point_prediction(active, plan, point), flux, point)
 
     _, push = jax.linearize(counts, neutral)
     flat, to_tree = ravel_pytree(neutral)
     size = min(limits.AMPLITUDES_AT_ONCE, max(flat.size, 1))
     change = jax.lax.map(lambda row: push(to_tree(row)), jnp.eye(flat.size), batch_size=size) * point.weight
     along = counts_and_slope(at_neutral, plan, unit, flux, point)[1] * point.weight
-    projected = project_flux(change, along, plan.exposures.flux_known, sharing(instrument, plan, point))
+    projected = project_flux(change, along, plan.exposures.flux_known, flux_groups(instrument, plan, point))
     return -projected.reshape(len(change), -1).T
 
 
@@ -121,7 +127,7 @@ class _AtPoint(NamedTuple):
 
     vectors: VectorSlopes  # leading axis: sites
     light: LightSlopes
-    share: Float[Array, "m e k"]  # of the counts at a site that a camera sees
+    share: Float[Array, "m e k"]  # fraction of the counts at a site that a camera sees
     counts: Float[Array, "m e k"]  # for light of unit flux at the sites, ahead of ghosts
     opposite: Float[Array, "e k"]  # of extended sources
     flux: Float[Array, "e f"]
@@ -133,17 +139,19 @@ class _AtPoint(NamedTuple):
 def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
     assert point.opposite_sky is not None
     x, y = jnp.stack([point.x, -point.x]), jnp.stack([point.y, -point.y])
-    sights = Sight(plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y)
+    illuminations = PointIllumination(
+        plan.exposures, jnp.stack([point.sky, point.opposite_sky]), point.source, x, y
+    )
     sites = 2 if light.has_ghosts(instrument) else 1
     vectors = jax.vmap(slots.vector_slopes, (None, None, 0, 0))(instrument, plan, x[:sites], y[:sites])
-    lights = jax.vmap(slots.light_slopes, (None, Sight(None, 0, None, 0, 0)))(
-        instrument, sights._replace(sky=sights.sky[:sites], x=x[:sites], y=y[:sites])
+    lights = jax.vmap(slots.light_slopes, (None, PointIllumination(None, 0, None, 0, 0)))(
+        instrument, illuminations._replace(sky=illuminations.sky[:sites], x=x[:sites], y=y[:sites])
     )
     counts = jnp.einsum("meks,meks->mek", vectors.vectors[:, point.band], lights.taken)
     if sites == 1:
         rows, throughput = light.band_rows(instrument, plan, x[1], y[1]), instrument.throughput.at(x[1], y[1])
-        sight = sights._replace(sky=point.opposite_sky, x=x[1], y=y[1])
-        opposite = light.counts(instrument, rows, throughput, sight, point.band)
+        illumination = illuminations._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+        opposite = light.counts(instrument, rows, throughput, illumination, point.band)
     else:
         opposite = counts[1]
     unit = light.with_ghosts(instrument, counts[0], opposite, point.source)
@@ -158,7 +166,7 @@ def _at_point(instrument: Instrument, plan: Plan, point: PointData) -> _AtPoint:
 
 
 def _visibilities(instrument: Instrument, plan: Plan, gaps: Float[Array, " g"]) -> Float[Array, " g"]:
-    """Share of the fringes of air that the band leaves of them that blurs them least."""
+    """Contrast of the fringes of air gaps in the band that blurs them least, 0 to 1."""
     phase = 4.0 * jnp.pi * gaps[:, None] / light.node_wavelengths(instrument, plan)
     weight = light.band_weights(instrument, plan)
     real, imaginary = jnp.cos(phase) @ weight.T, jnp.sin(phase) @ weight.T
@@ -173,7 +181,7 @@ def _pushed(
     x: Float[Array, " p"],
     y: Float[Array, " p"],
 ) -> Float[Array, "a p e k"]:
-    """Change of the counts that the detectors report, for counts that change."""
+    """Change of the counts that the detectors report, for changes (a, p, e, k) of the counts that arrive."""
 
     def at(
         counts: Float[Array, "e k"], change: Float[Array, "e k"], x: Float[Array, ""], y: Float[Array, ""]
@@ -220,7 +228,7 @@ class Columns:
         self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
         self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 
-    def has(self, change: Change) -> bool:
+    def has(self, change: SumOfSentences) -> bool:
         """True if a change is a sum of slots to first order."""
         try:
             self.terms_of(change)
@@ -228,7 +236,7 @@ class Columns:
             return False
         return True
 
-    def terms_of(self, change: Change) -> list[SlotTerm]:
+    def terms_of(self, change: SumOfSentences) -> list[SlotTerm]:
         """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
         terms = []
         for size, sentence in change:
@@ -290,7 +298,7 @@ class Columns:
         if planned is not None:
             return np.asarray(planned)
         _, residual = self.likelihood.residuals(self.values)
-        residual = self.likelihood.sharing.independent(residual, inverse=True)
+        residual = self.likelihood.flux_groups.independent(residual, inverse=True)
         counts, weight = map(self.likelihood.points.gathered, ("counts", "weight"))
         used = self.likelihood.used[..., None]
         return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
@@ -321,18 +329,18 @@ class Columns:
             self._fringes[start, gaps] = joined
         return joined
 
-    def of(self, changes: Sequence[Change]) -> Float[np.ndarray, "d a"]:
+    def of(self, changes: Sequence[SumOfSentences]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
         return self.rounded(changes, len(changes))[0]
 
     def rounded(
-        self, changes: Sequence[Change], exact: int
+        self, changes: Sequence[SumOfSentences], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
         return next(self.in_pieces(changes, exact, max(1, len(self.likelihood.used))))
 
     def in_pieces(
-        self, changes: Sequence[Change], exact: int, points: int
+        self, changes: Sequence[SumOfSentences], exact: int, points: int
     ) -> Iterator[tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]]:
         """The same for so many points at a time (whole blocks of `limits.RESPONSES_TOGETHER`), one after the other."""
         changed_terms = [self.terms_of(change) for change in changes]
@@ -369,7 +377,7 @@ class ResponseBlock:
         self.value = np.asarray(of.patched.standard.values(source, of.exposures.colour))
         self.used = weight[..., 0] > 0
         self.linear = light.is_linear(of.patched)
-        self.shared = sharing(of.patched, of.plan, data)
+        self.shared = flux_groups(of.patched, of.plan, data)
         self.whole = not self.linear or not self.shared.single
         self.chosen = np.arange(self.used.size) if self.whole else np.flatnonzero(self.used)
         self.sites, self.cameras = self.found.share.shape[1], weight.shape[2]

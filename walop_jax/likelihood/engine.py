@@ -10,8 +10,8 @@ Three layers, each with its own small Jacobian:
 
 Flux           of every (exposure, point) is eliminated (`flux.py`). Where an effect of the detectors D acts, the model
                is D(F a), F follows by Newton steps and ∂D/∂F takes the place of a.
-Exposures      are not compressed beforehand, although light is linear in them: with the flux eliminated all that could
-               be kept of a point holds only near one set of values, as F and â depend on them.
+Exposures      are not compressed into sums beforehand, although light is linear in them: with the flux eliminated, such
+               sums would hold only near one set of parameter values, on which F and â depend.
 """
 
 from __future__ import annotations
@@ -26,24 +26,28 @@ from jaxtyping import Array, Float, Int
 
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import FieldTable
-from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_positions, to_all
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import Counts
-from walop_jax.model.parameters import Vector, values_of, with_values
+from walop_jax.model.parameters import ParameterVector, values_of, with_values
 from walop_jax.model.plan import Plan
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
 
 Flux = Float[Array, "e f"]
 Nodes = FieldTable | None
-NEWTON_STEPS = 3  # each squares the share of the detectors' distortion that is missing from the flux
+NEWTON_STEPS = 3  # each squares the fraction of the detectors' distortion that is missing from the flux
 
 
 class PointData(NamedTuple):
-    """Measurements at field points (leading axis p), dense in the exposures; `weight` is 1/σ, 0 where unused."""
+    """Measurements at field points (leading axis p), dense in the exposures (e) and cameras (k).
+
+    `counts` are electrons, `weight` is 1/σ of them, 0 where an intensity is not used. `sky` and `source` as in
+    `PointIllumination`; `band` is the band of the exposure at this point (`Plan.band_of`).
+    """
 
     x: Float[Array, " p"]
     y: Float[Array, " p"]
@@ -53,20 +57,20 @@ class PointData(NamedTuple):
     source: Int[Array, "p e"]
     band: Int[Array, "p e"]
     opposite_sky: Float[Array, "p e 2"] | None = None  # the sky at (−X, −Y), only where an effect asks for it
-    stars: Float[Array, "p e k c"] | None = None  # `Sharing.stars`, only where stars of a field scatter
+    stars: Float[Array, "p e k c"] | None = None  # `FluxGroups.stars`, only where stars of a field scatter
 
-    def sight(self, plan: Plan) -> Sight:
-        """Quantities of a field point that the model asks for."""
-        return Sight(plan.exposures, self.sky, self.source, self.x, self.y)
+    def illumination(self, plan: Plan) -> PointIllumination:
+        """The light that this one point sees in the exposures of a plan."""
+        return PointIllumination(plan.exposures, self.sky, self.source, self.x, self.y)
 
 
-def sharing(instrument: Instrument, plan: Plan, point: PointData | None = None) -> Sharing:
-    """Common fluxes of cameras and of the exposures of a plan; at a point, common q, u of its star."""
+def flux_groups(instrument: Instrument, plan: Plan, point: PointData | None = None) -> FluxGroups:
+    """Which intensities of a plan have a flux in common; at a point, which exposures of a star its own q, u."""
     stars = None if point is None else point.stars
-    return Sharing(instrument.cameras.together, plan.exposures.shared, stars)
+    return FluxGroups(instrument.cameras.together, plan.exposures.shared, stars)
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """χ², and with respect to all parameters its half gradient Jᵀr and Gauss–Newton matrix JᵀJ."""
 
     chi2: Float[Any, ""]
@@ -82,9 +86,12 @@ def field_sites(instrument: Instrument, point: PointData) -> tuple[Float[Array, 
 
 
 def rows_at(
-    values: Vector, template: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
+    values: ParameterVector, template: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
 ) -> Float[Array, "m b r 4"]:
-    """Band rows at the sites of a point, of an instrument with these values of its parameters; with their slopes."""
+    """Band rows (site, band, row, 4) at the sites of a point, for an instrument with `values` as its parameters.
+
+    They carry the slopes of the optics with them when they are differentiated (`optics.band_rows`).
+    """
     sites = field_sites(template, point)
     if nodes is None:
         return jax.vmap(optics.band_rows, (None, None, None, 0, 0))(values, template, plan, *sites)
@@ -94,7 +101,7 @@ def rows_at(
 
 
 def throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
-    """Throughputs of the cameras at the sites of a point."""
+    """Throughputs (site, camera) of the cameras at the sites of a point."""
     return jax.vmap(instrument.throughput.at)(*field_sites(instrument, point))
 
 
@@ -105,32 +112,37 @@ def unit_counts(
     throughput: Float[Array, "m k"],
     point: PointData,
 ) -> Counts:
-    """Counts for light of unit flux, ahead of the detectors."""
+    """Counts (e, k) for light of unit flux, ahead of the detectors, from band rows and throughputs at the sites of a
+    point.
+    """
     x, y = field_sites(instrument, point)
-    sight = point.sight(plan)
-    counts = light.counts(instrument, rows[0], throughput[0], sight, point.band)
+    illumination = point.illumination(plan)
+    counts = light.counts(instrument, rows[0], throughput[0], illumination, point.band)
     if point.opposite_sky is None or len(x) == 1:
         return counts
-    sight = sight._replace(sky=point.opposite_sky, x=x[1], y=y[1])
-    opposite = light.counts(instrument, rows[1], throughput[1], sight, point.band)
+    illumination = illumination._replace(sky=point.opposite_sky, x=x[1], y=y[1])
+    opposite = light.counts(instrument, rows[1], throughput[1], illumination, point.band)
     return light.with_ghosts(instrument, counts, opposite, point.source)
 
 
 def point_prediction(instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None) -> Counts:
-    """Counts of one point for light of unit flux, ahead of the detectors."""
+    """Counts (e, k) of one point for light of unit flux, ahead of the detectors."""
     rows = rows_at(values_of(instrument), instrument, plan, point, nodes)
     return unit_counts(instrument, plan, rows, throughput_at(instrument, point), point)
 
 
 def vectors_at(instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None) -> light.Vectors:
-    """Analysis vectors of a point in every band."""
+    """Analysis vectors (band, camera, 4) of a point."""
     rows = rows_at(values_of(instrument), instrument, plan, point, nodes)[0]
     return light.camera_vectors(instrument, rows, throughput_at(instrument, point)[0], point.x, point.y)
 
 
 def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> Flux:
-    """Flux that fits best: in closed form, refined by Newton steps where detectors are not linear in it."""
-    flux_known, shared = plan.exposures.flux_known, sharing(instrument, plan)
+    """The flux (e, f) that fits best, in electrons per unit of unpolarised light.
+
+    It comes in closed form, refined by Newton steps where the detectors are not linear in it.
+    """
+    flux_known, shared = plan.exposures.flux_known, flux_groups(instrument, plan)
     flux, _ = eliminate_flux(point.counts * point.weight, unit * point.weight, flux_known, shared)
     if not light.is_linear(instrument):
         for _ in range(NEWTON_STEPS):
@@ -141,39 +153,41 @@ def best_flux(instrument: Instrument, plan: Plan, unit: Counts, point: PointData
     return flux
 
 
-def real_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData) -> Counts:
-    """Counts that the detectors report for light of a flux, `unit` being the counts for light of unit flux."""
+def detected_counts(instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData) -> Counts:
+    """Counts (e, k) that the detectors report for a flux; `unit` are the counts for light of unit flux."""
     return light.detected(instrument, plan.exposures, flux * unit, point.x, point.y)
 
 
 def counts_and_slope(
     instrument: Instrument, plan: Plan, unit: Counts, flux: Flux, point: PointData
 ) -> tuple[Counts, Counts]:
-    """The same, and their derivative with respect to the flux."""
-    return jax.jvp(lambda f: real_counts(instrument, plan, unit, f, point), (flux,), (jnp.ones_like(flux),))
+    """Counts (e, k) as `detected_counts` gives them, and their derivative with respect to the flux."""
+    return jax.jvp(
+        lambda f: detected_counts(instrument, plan, unit, f, point), (flux,), (jnp.ones_like(flux),)
+    )
 
 
 def point_residuals(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
 ) -> tuple[Flux, Counts]:
-    """Best flux of every exposure of one point and the normalised residuals data − model."""
+    """Best flux (e, f) in every exposure of one point, and normalised residuals (data − model)/σ (e, k)."""
     return residuals_of(instrument, plan, point_prediction(instrument, plan, point, nodes), point)
 
 
 def residuals_of(instrument: Instrument, plan: Plan, unit: Counts, point: PointData) -> tuple[Flux, Counts]:
-    """Best flux of every exposure and the normalised residuals, from the counts for light of unit flux."""
+    """Best flux (e, f) and normalised residuals (e, k) from the counts for light of unit flux."""
     flux = best_flux(instrument, plan, unit, point)
-    residual = (point.counts - real_counts(instrument, plan, unit, flux, point)) * point.weight
-    return flux, sharing(instrument, plan, point).independent(residual)
+    residual = (point.counts - detected_counts(instrument, plan, unit, flux, point)) * point.weight
+    return flux, flux_groups(instrument, plan, point).independent(residual)
 
 
 def _linear_unit_counts(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes
 ) -> LocalDerivatives:
-    """Counts of one point for light of unit flux, and their derivatives with respect to its local quantities."""
+    """Counts (e, k) of one point for light of unit flux, and their derivatives in its local quantities."""
     to_instrument = with_values(instrument)
 
-    def counts(values: Vector, local: Float[Array, "m k"]) -> Counts:
+    def counts(values: ParameterVector, local: Float[Array, "m k"]) -> Counts:
         rows = rows_at(values, instrument, plan, point, nodes)
         return unit_counts(to_instrument(values), plan, rows, local, point)
 
@@ -183,7 +197,7 @@ def _linear_unit_counts(
 def _star_responses(
     instrument: Instrument, plan: Plan, fields: Float[Array, "f s"], data: PointData
 ) -> Float[Array, "p e k c"]:
-    """Share by which counts of a star change for 1 rms (`fields`, field by field) of q, then of u."""
+    """Relative change of the counts of a star for 1 rms of q, then of u; `fields` holds the rms, field by field."""
     standard = instrument.standard
 
     def counts(off: Float[Array, "2 f"], point: PointData) -> Counts:
@@ -199,7 +213,7 @@ def _star_responses(
 
 
 def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> tuple[Counts, Float[Array, "e k n"]]:
-    """Counts of one point for light of unit flux, and their derivatives with respect to all parameters."""
+    """Counts (e, k) of one point for light of unit flux, and their derivatives (e, k, n) in all parameters."""
     unit, plain, local = _linear_unit_counts(instrument, plan, point, None)
     basis = instrument.throughput.basis(*field_sites(instrument, point))
     return unit, to_all(instrument, plain, local, basis)
@@ -229,19 +243,22 @@ def _point_jacobian(
         all_values = jnp.concatenate([unit_steps, jnp.zeros((throughput.size, values.size))])
         d_counts = jax.vmap(push_detector)(all_values, d_counts)
         along = push_detector(jnp.zeros_like(values), unit)
-    shared = sharing(instrument, plan, point)
+    shared = flux_groups(instrument, plan, point)
     projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known, shared)
     residual = shared.independent((point.counts - counts) * point.weight)
     return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
 
 
-def normal_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None) -> Normal:
-    """χ² and its expansion from some points: with optics on nodes block by block, else from the rows of all points.
+def normal_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None
+) -> NormalEquations:
+    """χ² and its expansion (`NormalEquations`) from some points.
 
-    Rows come from a program that errors and verdict need anyway, `limits.BATCH` points at a time.
+    With optics on `nodes` the sums are made block by block; without, from the Jacobian of all points at once, which
+    comes from a program that errors and verdict need anyway, `limits.BATCH` points at a time.
     """
     if nodes is not None:
-        return Normal(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
+        return NormalEquations(*map(np.asarray, _table_equations(instrument, plan, data, nodes)))
     size, chi2, gradient, matrix = values_of(instrument).size, 0.0, 0.0, 0.0
     for start in range(0, len(data.x), limits.BATCH):
         rows = slice(start, start + limits.BATCH)
@@ -250,11 +267,14 @@ def normal_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
         residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
         r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
-    return Normal(chi2, gradient, matrix)
+    return NormalEquations(chi2, gradient, matrix)
 
 
-def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
-    """Sums over blocks of points, whose intermediate results stay in the processor's cache; few are one block."""
+def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> NormalEquations:
+    """The normal equations as a sum over blocks of points, whose intermediate results stay in the processor's cache.
+
+    Few points are one block.
+    """
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
         return _block_equations(instrument, plan, data, nodes)
@@ -263,7 +283,7 @@ def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldT
 
 
 def summed(function: Callable[[Any], Any], parts: Any) -> Any:
-    """Sums of the results of a function for the slices along the first axis, one after the other."""
+    """The sum of what `function` returns for the slices of `parts` along the first axis, one after the other."""
     first = jax.eval_shape(function, jax.tree.map(lambda v: v[0], parts))
     nothing = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), first)
 
@@ -273,7 +293,9 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     return jax.lax.scan(add, nothing, parts)[0]
 
 
-def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable) -> Normal:
+def _block_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable
+) -> NormalEquations:
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
     def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
@@ -297,7 +319,7 @@ def _block_equations(instrument: Instrument, plan: Plan, data: PointData, nodes:
     matrix = matrix.at[np.ix_(plain, plain)].set(gram[:, :k, :k].sum(axis=0))
     matrix = matrix.at[np.ix_(plain, series)].set(cross).at[np.ix_(series, plain)].set(cross.T)
     matrix = matrix.at[np.ix_(series, series)].set(square)
-    return Normal(chi2.sum(), g, matrix)
+    return NormalEquations(chi2.sum(), g, matrix)
 
 
 def _residuals(
@@ -309,7 +331,7 @@ def _residuals(
 def residuals_and_slopes(
     instrument: Instrument, plan: Plan, data: PointData
 ) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
-    """All residuals and their derivatives with respect to all parameters."""
+    """All residuals (p, d) and their derivatives (p, d, n) in all parameters; d runs over exposures, then cameras."""
     residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size
@@ -318,7 +340,7 @@ def residuals_and_slopes(
 
 
 def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
-    return light.stokes(instrument, point.sight(plan))
+    return light.stokes(instrument, point.illumination(plan))
 
 
 incoming = compiled(jax.vmap(_incoming, (None, None, 0)), kept_as="incoming")

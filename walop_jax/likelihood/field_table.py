@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.optics import rows_and_slopes
 from walop_jax.model import chebyshev
@@ -37,7 +38,6 @@ from walop_jax.model.plan import Plan
 
 # --------------------------------------------------------------------------- functions of the field as Chebyshev series
 
-Vector = Float[np.ndarray, " p"]
 Tree = Any
 """Arrays, or a tuple of them, with the field positions (or the terms of a series) along the first axis."""
 
@@ -76,7 +76,7 @@ class FieldTable(eqx.Module):
         return (across[..., :, None] * along[..., None, :]).reshape(*across.shape[:-1], -1)
 
     def __call__(self, x: Float[Any, "*p"], y: Float[Any, "*p"]) -> Tree:
-        """The functions at field positions (deg); arrays of numpy give such."""
+        """The functions at field positions (deg); arrays of numpy give arrays of numpy."""
         xp, basis = (jnp if isinstance(x, jax.Array) else np), self.basis(x, y)
         return jax.tree.map(lambda leaf: xp.tensordot(basis, leaf, 1), self.coefficients)
 
@@ -87,7 +87,7 @@ def _terms(count: int, total: bool) -> tuple[Int[np.ndarray, " t"], Int[np.ndarr
     return i[included], j[included]
 
 
-def held_out(rectangle: Rectangle, details: Sequence[tuple[float, float]] = ()) -> tuple[Vector, Vector]:
+def held_out(rectangle: Rectangle, details: Sequence[tuple[float, float]] = ()) -> tuple[OfPoints, OfPoints]:
     """Places at which a table is checked: the corners, the middles of the sides, and a spread of others.
 
     The others follow the sequence of Roberts 2018 (multiples of 1/φ and 1/φ², φ³ = φ + 1), which falls on no grid.
@@ -112,7 +112,7 @@ def details_of(instrument: Instrument) -> list[tuple[float, float]]:
 
 
 def accurate_table(
-    exact: Callable[[Vector, Vector], Tree],
+    exact: Callable[[OfPoints, OfPoints], Tree],
     rectangle: Rectangle,
     counts: Sequence[int],
     tolerance: float,
@@ -157,7 +157,7 @@ TOLERANCE = 2e-10
 _solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)), kept_as="nodes")
 
 
-def solved_optics(instrument: Instrument, plan: Plan, x: Vector, y: Vector) -> Optics:
+def solved_optics(instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
     return in_batches(lambda x, y: _solve(instrument, plan, array(x), array(y)), x, y)
 
@@ -171,7 +171,7 @@ def in_batches(
     """Results of `solve` for the rows of columns, a tree of arrays, `size` rows at a time, as it is compiled for."""
 
     def solved(start: int) -> Any:
-        # The last batch is filled up with its last row, which keeps the arithmetic as tame as that of the data.
+        # The last batch is filled up with its last row, so that padding cannot overflow or give NaN.
         rows = np.minimum(np.arange(start, start + size), len(columns[0]) - 1)
         return jax.tree.map(np.asarray, solve(*(column[rows] for column in columns)))
 
@@ -182,7 +182,7 @@ def in_batches(
 
 
 def accurate_nodes(
-    instrument: Instrument, plan: Plan, rectangle: Rectangle, scale: Vector, first: int | None = None
+    instrument: Instrument, plan: Plan, rectangle: Rectangle, scale: OfPoints, first: int | None = None
 ) -> tuple[FieldTable | None, float]:
     """The smallest table of the optics (of at least `first` nodes per side) accurate to `TOLERANCE`, and its error.
 

@@ -7,8 +7,8 @@ Source      Kaufman's form of variable projection (Golub & Pereyra 2003, Inverse
             is exact, and JᵀJ is the Fisher information with the flux marginalised; a star of a field that is off by
             δ ~ N(0, 1) in a direction adds A Aᵀ to the covariance of its r, A = ∂r/∂δ, and r ← (1 + A Aᵀ)^(−1/2) r
             as well as d makes them independent again (`inverses.of_low_rank`)
-Limits      where the flux is known, F = 1 and nothing is projected; where the shares of the arms are unknown
-            (`Cameras.split`), y·a and a·a run over the cameras and exposures that have a flux in common (`Sharing`)
+Limits      where the flux is known, F = 1 and nothing is projected; where the fractions of the light in the arms are
+            unknown (`Cameras.split`), y·a and a·a run over the cameras and exposures of one flux (`FluxGroups`)
 """
 
 from __future__ import annotations
@@ -27,11 +27,16 @@ def namespace(*arrays: Any) -> ModuleType:
     return jnp if any(isinstance(array, jax.Array) for array in arrays) else np
 
 
-class Sharing(NamedTuple):
-    """Common fluxes: `cameras` is 1 where two of them share one, `exposures` where one is of a group that does.
+class FluxGroups(NamedTuple):
+    """Which intensities of a field point have one unknown flux in common.
 
-    None: all cameras; every exposure for itself. `stars` is U of 1 − U Uᵀ = (1 + A Aᵀ)^(−1/2) at a point, where the
-    exposures of a star have its own q, u in common; None: no star differs from its catalogue.
+    `cameras[k, l]` is 1 if cameras k and l have one flux; None: all cameras have one. `exposures[e, g]` is 1 if
+    exposure e belongs to flux group g; None: every exposure has a flux of its own. `FluxGroups()` is the usual case: a
+    flux for each exposure, the same for all cameras. A steady lamp seen in three exposures is one group: a column of
+    three ones.
+
+    `stars` is for stars of a field that differ from its mean q, u in all exposures of a point alike: the matrix U of 1
+    − U Uᵀ = (1 + A Aᵀ)^(−1/2) at each point (`Source` in the head of this file); None: no star differs.
     """
 
     cameras: Float[Any, "k k"] | None = None
@@ -44,7 +49,9 @@ class Sharing(NamedTuple):
         return self.exposures is None and self.stars is None
 
     def summed(self, values: Float[Any, "... e k"]) -> Float[Any, "... e f"]:
-        """Sums over intensities with a common flux, once for all cameras (f = 1) or camera by camera (f = k)."""
+        """Sums over the intensities with a common flux: once for all cameras (f = 1), or for each camera the sum of its
+        group (f = k).
+        """
         by_camera = values.sum(axis=-1, keepdims=True) if self.cameras is None else values @ self.cameras
         if self.exposures is None:
             return by_camera
@@ -53,7 +60,7 @@ class Sharing(NamedTuple):
         return xp.einsum("...sk,es->...ek", groups, self.exposures)
 
     def independent(self, values: Float[Any, "... e k"], inverse: bool = False) -> Float[Any, "... e k"]:
-        """Weighted residuals or derivatives, the flux eliminated, with errors that are independent; or back."""
+        """Weighted residuals or derivatives, the flux eliminated, made independent; `inverse` undoes it."""
         if self.stars is None:
             return values
         xp = namespace(values)
@@ -66,7 +73,7 @@ class Sharing(NamedTuple):
         return (flat - (flat @ xp.swapaxes(back, -2, -1)) @ xp.swapaxes(stars, -2, -1)).reshape(values.shape)
 
 
-ALONE = Sharing()
+ALONE = FluxGroups()
 """A flux for every exposure, of all cameras."""
 
 
@@ -74,9 +81,9 @@ def eliminate_flux(
     weighted_counts: Float[Any, "... k"],
     weighted_model: Float[Any, "... k"],
     flux_known: Bool[Any, ...],
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
 ) -> tuple[Float[Any, "... f"], Float[Any, "... k"]]:
-    """Best flux of every exposure and the normalised residuals data − model; f as in `Sharing.summed`."""
+    """Best flux of every exposure and the normalised residuals data − model; f as in `FluxGroups.summed`."""
     xp = namespace(weighted_model)
     power = shared.summed(weighted_model**2)
     best = shared.summed(weighted_counts * weighted_model) / xp.where(power > 0, power, 1.0)
@@ -88,7 +95,7 @@ def project_flux(
     columns: Float[Any, "... k"],
     along: Float[Any, "... k"],
     flux_known: Bool[Any, ...] | bool = False,
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
 ) -> Float[Any, "... k"]:
     """Derivatives of weighted counts, `columns`, without the component along a change of the flux.
 

@@ -195,7 +195,7 @@ class Forward(eqx.Module):
             instrument, unit = self._unit(values, point)
             if flux is None:
                 flux = engine.best_flux(instrument, self.plan, unit, self._with_errors(instrument, point)[0])
-            return engine.real_counts(instrument, self.plan, unit, flux, point)
+            return engine.detected_counts(instrument, self.plan, unit, flux, point)
 
         return self._whole(jax.lax.map(lambda part: jax.vmap(of)(*part), (self.data, flux)))
 
@@ -286,7 +286,7 @@ class Forward(eqx.Module):
         def of(point: PointData) -> Array:
             instrument, unit = self._unit(values, point)
             point, ratio = self._with_errors(instrument, point)
-            shared = engine.sharing(instrument, self.plan)
+            shared = engine.flux_groups(instrument, self.plan)
             return jnp.sum(log_variance(ratio, unit * point.weight, self.plan.exposures.flux_known, shared))
 
         return jnp.sum(jax.vmap(of)(data))

@@ -8,15 +8,15 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-Matrix = Float[np.ndarray, "_ _"]
+from walop_jax.io.shapes import AnyMatrix
 
 RANK_TOLERANCE = 1e-8
 
 
-def whitening(matrix: Matrix, least: float = RANK_TOLERANCE) -> Matrix:
+def whitening(matrix: AnyMatrix, least: float = RANK_TOLERANCE) -> AnyMatrix:
     """W with Wᵀ G W = 1 on the range of a symmetric matrix G, so that W Wᵀ is its inverse there.
 
-    With a diagonal of ones, directions of which the matrix has less than the share `least` of its largest eigenvalue
+    With a diagonal of ones, directions of which the matrix has less than the fraction `least` of its largest eigenvalue
     are left out, and rows of zeros with them.
     """
     norm = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
@@ -26,13 +26,13 @@ def whitening(matrix: Matrix, least: float = RANK_TOLERANCE) -> Matrix:
     return scale[:, None] * vector[:, keep] / np.sqrt(value[keep])
 
 
-def pseudo_inverse(matrix: Matrix, least: float) -> Matrix:
+def pseudo_inverse(matrix: AnyMatrix, least: float) -> AnyMatrix:
     """The inverse of a symmetric matrix on what `whitening` keeps of it, zero elsewhere."""
     root = whitening(matrix, least)
     return root @ root.T
 
 
-def determined(matrix: Matrix, weak: Float[np.ndarray, " _"]) -> float:
+def determined(matrix: AnyMatrix, weak: Float[np.ndarray, " _"]) -> float:
     """Number of parameters that data determine: the trace of (G − L) G⁻¹, that of the hat matrix.
 
     G is the matrix of data, priors and the weak pulls whose precisions L (a diagonal) are no knowledge: a parameter
@@ -41,7 +41,7 @@ def determined(matrix: Matrix, weak: Float[np.ndarray, " _"]) -> float:
     return len(weak) - float(weak @ np.sum(whitening(matrix, 1e-15) ** 2, axis=1))
 
 
-def unit_columns(matrix: Matrix) -> tuple[Matrix, Float[np.ndarray, " _"]]:
+def unit_columns(matrix: AnyMatrix) -> tuple[AnyMatrix, Float[np.ndarray, " _"]]:
     """The columns of a matrix at unit length, and their lengths; of a column of zeros the length is 1."""
     length = np.linalg.norm(matrix, axis=0)
     length = np.where(length > 0, length, 1.0)
@@ -55,7 +55,7 @@ def square_root(covariance: Float[np.ndarray, "*r n n"]) -> Float[np.ndarray, "*
 
 
 def root_of(matrices: Float[np.ndarray, "r n n"], least: float = 0.0) -> Float[np.ndarray, "r n b"]:
-    """B with B Bᵀ the matrices, without eigenvalues below a share `least` of the largest (none: as many columns)."""
+    """B with B Bᵀ the matrices, without eigenvalues below a fraction `least` of the largest (none: as many columns)."""
     root = square_root(matrices)
     value = np.sum(root**2, axis=1)
     return root[:, :, -int((value > least * value[:, -1:]).sum(axis=1).max()) :]

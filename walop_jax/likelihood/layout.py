@@ -23,12 +23,12 @@ from walop_jax.data.records import (
     Sources,
 )
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.engine import PointData, sharing, star_responses
+from walop_jax.likelihood.engine import PointData, flux_groups, star_responses
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import of_low_rank
 from walop_jax.likelihood.noise import NoiseTerms, variance_ratio
 from walop_jax.model import light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
@@ -102,7 +102,7 @@ class Layout:
 
     @property
     def batches(self) -> int:
-        """Number of batches."""
+        """Number of batches of field points, the last one filled up."""
         return -(-self.points // self.batch)
 
     @property
@@ -112,9 +112,10 @@ class Layout:
 
 
 def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
-    """The instrument whose retarders the wavelength nodes follow: at the start, or as thick as those of the template.
+    """The instrument whose retarders the wavelength nodes of a plan must follow.
 
-    A fit that has made them thicker than the start has put them there.
+    Its retarders are those of the start values or of the template, whichever are thicker: after a fit that has
+    thickened the plates, the template holds the fitted thicknesses.
     """
     if np.array_equal(values_of(model.template), model.start):
         return model.template
@@ -123,19 +124,21 @@ def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
 
 
 def curves_of(calset: CalibrationSet) -> list[FilterCurve]:
-    """The curves of the filters in use."""
+    """The filter curves that the exposures of a set use."""
     names = np.unique(calset.exposures.filter).tolist()
     return [calset.filters[name] for name in names if name in calset.filters]
 
 
 def fields_of_stars(sources: Sources) -> Float[np.ndarray, "f s"]:
-    """For each field of stars that scatter their rms, in its own rows of SOURCES; 0 in those of others."""
+    """For each field of stars that scatter, a row with the rms of its stars at their rows of SOURCES, and 0 at all
+    others.
+    """
     firsts = np.unique(sources.stars[sources.scatter > 0])
     return np.where(sources.stars == firsts[:, None], sources.scatter, 0.0)
 
 
 def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
-    """The part of the field on which optics are needed; ghosts need those of the opposite points too."""
+    """The part of the field on which the optics are needed; with ghosts (`mirrored`) also at the opposite points."""
     xy = np.stack([calset.points.x, calset.points.y])
     low, high = xy.min(axis=1), xy.max(axis=1)
     if mirrored:
@@ -144,14 +147,14 @@ def _rectangle(calset: CalibrationSet, *, mirrored: bool) -> Rectangle:
     return Rectangle(low - thin, high + thin)
 
 
-class RunsOfPoints(Intensities):
-    """Runs of `length` neighbouring points of a set, beginning at the points `starts`."""
+class BlocksOfPoints(Intensities):
+    """A sample of a set: blocks of `length` neighbouring points, which begin at the points `starts`."""
 
     def __init__(self, whole: Intensities, starts: Int[np.ndarray, " s"], length: int) -> None:
         self.whole, self.starts, self.length = whole, starts, length
 
     def block(self, start: int, stop: int) -> Block:
-        """Return the data of the points `start:stop` of the runs, read from the whole set."""
+        """The data of the points `start:stop` of the sample, read from the whole set."""
         blocks = []
         for number in range(start // self.length, math.ceil(stop / self.length)):
             first, origin = number * self.length, int(self.starts[number])
@@ -171,33 +174,33 @@ class RunsOfPoints(Intensities):
 
 
 def thinned(calset: CalibrationSet, most: int, neighbours: int = limits.NEIGHBOURS) -> CalibrationSet:
-    """A set of at most `most` of the points: runs of at least `neighbours` spread evenly over all of them.
+    """A set of at most `most` of the points: blocks of at least `neighbours` neighbours, spread evenly over the set.
 
-    There are 16 runs or more and 128 at most, so they are shorter or longer than that in a very small or a very large
-    sample. A set that is not larger than that comes back as it is.
+    There are 16 blocks or more and 128 at most, so that blocks are shorter than `neighbours` in a very small sample and
+    longer in a very large one. A set of at most `most` points comes back as it is.
     """
     n = len(calset.points)
     if n <= most:
         return calset
-    fewest, largest = limits.RUNS
+    fewest, largest = limits.BLOCKS
     length = max(1, min(max(neighbours, most // largest), most // fewest))
     starts = _spread(n, most, length)
     index = (starts[:, None] + np.arange(length)).ravel()
     points = Points(*(getattr(calset.points, f.name)[index] for f in dataclasses.fields(Points)))
-    runs = RunsOfPoints(calset.intensities, starts, length)
-    return dataclasses.replace(calset, points=points, intensities=runs)
+    blocks = BlocksOfPoints(calset.intensities, starts, length)
+    return dataclasses.replace(calset, points=points, intensities=blocks)
 
 
 def _spread(points: int, sample: int, length: int) -> Int[np.ndarray, " s"]:
-    """The first points of runs spread evenly; multiples of the golden section are in step with no raster."""
+    """The first points of blocks spread evenly; multiples of the golden section are in step with no raster."""
     places = np.mod(np.arange(max(1, sample // length)) * 0.6180339887498949, 1.0)
     return np.unique((places * (points // length)).astype(int)) * length
 
 
 def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
-    """Median over the field of the measured counts of each camera in each exposure; 0 where nothing is used.
+    """Median over the field of the measured counts of each camera in each exposure (e, k); 0 where nothing is used.
 
-    Of a set with more than `limits.MEDIAN_POINTS` points, runs spread evenly over it are enough.
+    Of a set with more than `limits.MEDIAN_POINTS` points a sample is taken, blocks spread evenly over it.
     """
     n, run, limit = len(calset.points), limits.MEDIAN_RUN, limits.MEDIAN_POINTS
     starts = range(0, n, run) if n <= limit else np.linspace(0, n - run, limit // run).astype(int)
@@ -209,7 +212,7 @@ def median_counts(calset: CalibrationSet) -> Float[np.ndarray, "e k"]:
 
 
 def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "e k"]:
-    """Median over the field of the counts of each camera in each exposure, NaN left out; 0 where all are."""
+    """Median over the field of the counts of each camera in each exposure (e, k), NaN left out; 0 where all are NaN."""
     measured = np.isfinite(counts[..., 0]).any(axis=0)
     median = np.zeros(counts.shape[1:])
     median[measured] = np.nanmedian(counts[:, measured], axis=0)
@@ -223,9 +226,10 @@ def median_over_field(counts: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "
 class PointReader:
     """Turns blocks of measurements into point data; `mirrored` with the sky at the opposite points, for ghosts.
 
-    No error is taken to be smaller than a share of the mean counts of its row (`Cameras.floor`); `instrument` gives
-    that, and how stars of a field that differ look in the cameras. `noise` are terms of the errors at known values: the
-    errors are those that the terms make of the stated ones; None: the stated ones.
+    No error is smaller than the fraction `Cameras.noise_floor` of the mean counts of its row. `instrument` holds that
+    fraction, and the responses of the cameras to stars of one field that differ in q, u. `noise` are terms of the
+    errors at known values: the errors of the data are then those that the terms make of the stated ones; with None they
+    are the stated ones.
     """
 
     calset: CalibrationSet
@@ -250,9 +254,9 @@ class PointReader:
         return batches
 
     def point_data(self, block: Block) -> PointData:
-        """A block of measurements as the engine wants it."""
+        """The point data of a block of measurements, as arrays of JAX."""
         band = np.take_along_axis(self.plan.band_of[None], block.source[:, :, None] + 1, axis=2)[:, :, 0]
-        sigma = with_floor(block.sigma, block.counts, self.instrument.cameras.floor)
+        sigma = with_noise_floor(block.sigma, block.counts, self.instrument.cameras.noise_floor)
         weight = np.where(block.used[:, :, None], 1.0 / np.where(sigma > 0, sigma, 1.0), 0.0)
         if self.noise is not None:
             weight = weight / np.sqrt(variance_ratio(self.noise, self.noise_terms, block.counts, weight))
@@ -276,10 +280,12 @@ class PointReader:
         return NoiseTerms.of(noise, self.calset.exposures.kind.tolist(), self.instrument.cameras.names)
 
     def _stars(self, data: PointData, fields: Float[np.ndarray, "f s"]) -> Float[np.ndarray, "p e k c"]:
-        """`Sharing.stars`: q, u of a star differ from those of its field by the same in all exposures of its point."""
+        """`FluxGroups.stars` of some points (p, e, k, c): a star is off by one q and one u in all exposures of its
+        point.
+        """
         share = np.asarray(star_responses(self.instrument, self.plan, array(fields), data))
         counts = np.asarray(data.counts) * np.asarray(data.weight)
-        shared = sharing(self.instrument, self.plan)
+        shared = flux_groups(self.instrument, self.plan)
         change = np.moveaxis(share * counts[..., None], -1, 0)
         change = project_flux(change, counts, np.asarray(self.plan.exposures.flux_known), shared)
         return of_low_rank(np.moveaxis(change, 0, -1))

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
-from walop_jax.likelihood.flux import Sharing
+from walop_jax.likelihood.flux import FluxGroups
 from walop_jax.likelihood.inverses import determined
 from walop_jax.likelihood.layout import (
     Layout,
@@ -35,12 +36,14 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.planning import outgrown
 from walop_jax.model.specification import Model
 
-Vector = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "n n"]
 
+class UsedData(NamedTuple):
+    """How much of a set is used, and where in the field: what degrees of freedom and maps are counted from.
 
-class Census(NamedTuple):
-    """Number of points used in each exposure; smallest and largest x, then y (deg), of those used in any; cameras."""
+    `rows` is the number of field points used in each exposure; `field` the smallest and largest x, then the smallest
+    and largest y (deg), of the points that are used in any exposure; `cameras` the number of cameras. Ten points in
+    two exposures of four cameras are rows (10, 10), that is 80 intensities.
+    """
 
     rows: Int[np.ndarray, " e"]
     field: tuple[float, float, float, float]
@@ -51,14 +54,14 @@ class Census(NamedTuple):
         """Number of intensities used."""
         return self.cameras * int(self.rows.sum())
 
-    def joined(self, other: Census) -> Census:
-        """Census of two parts of a set."""
+    def joined(self, other: UsedData) -> UsedData:
+        """The counts of two parts of a set, added, and the rectangle around both fields."""
         (a, b, c, d), (e, f, g, h) = self.field, other.field
-        return Census(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
+        return UsedData(self.rows + other.rows, (min(a, e), max(b, f), min(c, g), max(d, h)), self.cameras)
 
 
 class DataTerms(NamedTuple):
-    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; the census.
+    """χ² of the data, its half gradient and Gauss–Newton matrix in all parameters, no priors; and which data were used.
 
     Where errors of the data have parameters, `log_variance` is the rest of −2 ln L (`noise.log_variance`), and gradient
     and matrix hold its part.
@@ -67,17 +70,19 @@ class DataTerms(NamedTuple):
     data: float
     gradient: Vector
     matrix: Matrix
-    census: Census
+    used_data: UsedData
     log_variance: float = 0.0
 
     def joined(self, other: DataTerms) -> DataTerms:
         """The terms of two parts of a set."""
-        a, b, census = self, other, self.census.joined(other.census)
+        a, b, used_data = self, other, self.used_data.joined(other.used_data)
         log_variance = a.log_variance + b.log_variance
-        return DataTerms(a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, census, log_variance)
+        return DataTerms(
+            a.data + b.data, a.gradient + b.gradient, a.matrix + b.matrix, used_data, log_variance
+        )
 
 
-Joined = TypeVar("Joined", Census, DataTerms)
+Joined = TypeVar("Joined", UsedData, DataTerms)
 
 
 class OpticsUsed(NamedTuple):
@@ -93,7 +98,7 @@ class Expansion:
 
     `gradient` is half the gradient of the total and `matrix` half its Gauss–Newton Hessian, both with the
     errors of the data times `noise_scale`; `data` and `chi2` are with the errors as given. `loose` is the
-    share of the weak pulls that are no prior knowledge; it is in the gradient and the matrix, not in
+    sum over the weak pulls, which are no prior knowledge; it is in the gradient and the matrix, not in
     `chi2`. `log_variance` is what −2 ln L has beside `chi2` where errors of the data have parameters (χ² is with the
     errors that these make), 0 where all errors are as stated. `dof` counts the independent data of every used row
     (`Likelihood.data_per_row`), one per prior, less the parameters that these determine (`determined`).
@@ -105,14 +110,14 @@ class Expansion:
     noise_scale: float
     gradient: Vector
     matrix: Matrix
-    census: Census
+    used_data: UsedData
     dof: int
     optics: OpticsUsed
     log_variance: float = 0.0
 
     @property
     def chi2(self) -> float:
-        """Sum over data and priors."""
+        """χ² of data and priors, with the errors of the data as given."""
         return self.data + self.priors
 
     @property
@@ -122,22 +127,22 @@ class Expansion:
 
     @property
     def objective(self) -> float:
-        """Number that a fit minimises."""
+        """The number that a fit minimises: −2 ln of the posterior density, without its constant."""
         return self.data / self.noise_scale**2 + self.log_variance + self.priors + self.loose
 
     @property
     def n_data(self) -> int:
         """Number of intensities used."""
-        return self.census.n_data
+        return self.used_data.n_data
 
 
 @dataclasses.dataclass(frozen=True)
 class PriorRows:
-    """Rows (θ − mean) / width of the parameters at `index`; those that are not `known` are weak pulls.
+    """Rows (θ − mean) / width of the parameters at `index`; rows that are not `known` are weak pulls.
 
-    A free parameter has one row: its prior if it has one, else the weak pull to its start value, if it has that. A
-    frozen one has none, for it does not vary; nor has a tied one, whose value is that of another: the prior of that
-    one is said there, and once.
+    A free parameter has one row: its prior if it has one, else the weak pull to its start value if it has that. A fixed
+    parameter has no row, for it does not vary. A tied parameter has no row either: its value is the value of its
+    master, whose prior is counted once. The magnification 15.63 ± 0.05 of a pupil has the row (θ − 15.63)/0.05.
     """
 
     index: Int[np.ndarray, " k"]
@@ -149,16 +154,16 @@ class PriorRows:
         return len(self.index)
 
     def residuals(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
-        """The rows at a full vector of values."""
+        """The rows (k) at a full vector of values (n)."""
         return (values[self.index] - self.mean) / self.width
 
     def jacobian(self, selection: Float[np.ndarray, "n f"]) -> Float[np.ndarray, "k f"]:
-        """Derivatives of the rows with respect to the free parameters; `selection` is that of the model."""
+        """Derivatives (k, f) of the rows in the free parameters; `selection` is `Model.selection`."""
         return selection[self.index] / self.width[:, None]
 
 
 def prior_rows(model: Model) -> PriorRows:
-    """Priors and weak pulls of the free parameters of a model."""
+    """The rows of all priors and weak pulls of the free parameters of a model."""
     rows = []
     for i in model.free.tolist():
         p = model.parameters[i]
@@ -223,7 +228,10 @@ class Likelihood:
         return cls(layout, MeasuredPoints(reader, layout), runner, model)
 
     def following(self, values: Vector) -> Likelihood:
-        """The same with wavelength nodes that follow the retarders at a full vector of values; itself if they do."""
+        """This likelihood with wavelength nodes that follow the retarders at a full vector of values (n).
+
+        It returns itself if its nodes follow them already.
+        """
         instrument = self.model.instrument(values)
         if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
             return self
@@ -232,9 +240,10 @@ class Likelihood:
         return Likelihood.of(self.calset, model, runner=self.runner, **how)
 
     def with_errors_at(self, values: Vector | None) -> Likelihood:
-        """The same with errors of the data held at a full vector of values; None: at those of each call.
+        """This likelihood with the errors of its data held at a full vector of values (n).
 
-        Itself where the errors have no parameters.
+        With None each call takes the errors of the values that it is given. It returns itself if the errors have no
+        parameters.
         """
         if self.model.template.noise is None:
             return self
@@ -249,7 +258,7 @@ class Likelihood:
 
     @property
     def calset(self) -> CalibrationSet:
-        """The set that the points are from."""
+        """The calibration set whose points it reads."""
         return self.points.reader.calset
 
     @property
@@ -269,16 +278,22 @@ class Likelihood:
 
     @property
     def data_per_row(self) -> Float[np.ndarray, " e"]:
-        """Independent data of a used row: an intensity for each camera, less its part of the unknown fluxes."""
+        """Independent data of a used row (e): one for each camera, less the fraction of the unknown fluxes that the row
+        pays for.
+
+        Of four cameras with one unknown flux these are three.
+        """
         groups = self.plan.exposures.shared
         size = np.ones(len(self.flux_known)) if groups is None else np.asarray(groups @ groups.sum(axis=0))
         return self.cameras - np.where(self.flux_known, 0.0, self.model.template.cameras.fluxes / size)
 
     @cached_property
-    def sharing(self) -> Sharing:
-        """Fluxes in common to cameras and exposures, and q, u in common to the exposures of a star, point by point."""
+    def flux_groups(self) -> FluxGroups:
+        """Which cameras and exposures have a flux in common, and which exposures of a star its own q, u, point by
+        point.
+        """
         stars = self.points.gathered("stars") if len(fields_of_stars(self.calset.sources)) else None
-        return engine.sharing(self.model.template, self.plan)._replace(stars=stars)
+        return engine.flux_groups(self.model.template, self.plan)._replace(stars=stars)
 
     @cached_property
     def priors(self) -> PriorRows:
@@ -295,10 +310,10 @@ class Likelihood:
     def nodes(
         self, instrument: Instrument, near: Expansion | None = None
     ) -> tuple[FieldTable | None, OpticsUsed]:
-        """The optics on nodes of the field, and how accurate; None where they are to be solved point by point.
+        """The optics on nodes of the field, and how accurate they are; None where they are to be solved point by point.
 
-        `near` is an expansion at similar values: as many nodes as it needed are tried first, and none if there are
-        never enough, since the optics oscillate over the field.
+        `near` is an expansion at similar values: as many nodes as it needed are tried first. If no number of nodes was
+        enough there, because the optics oscillate over the field, none is tried here.
         """
         hint = None if near is None else near.optics.nodes_per_side
         if not self.layout.interpolated or (near is not None and hint is None):
@@ -320,7 +335,7 @@ class Likelihood:
         return self.expanded(values, terms, noise_scale, optics)
 
     def data_terms(self, values: Vector, near: Expansion | None = None) -> tuple[DataTerms, OpticsUsed]:
-        """Terms of the data at a full vector of parameter values; `near` as for `expand`."""
+        """χ² of the data with its expansion at a full vector of values, and the optics used; `near` as for `expand`."""
         instrument = self.model.instrument(values)
         nodes, optics = self.nodes(instrument, near)
 
@@ -343,7 +358,7 @@ class Likelihood:
         data = stated._replace(weight=array(weight / np.sqrt(ratio)))
         chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
         residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
-        shared = engine.sharing(instrument, self.plan)
+        shared = engine.flux_groups(instrument, self.plan)
         of_errors = noise_expansion(
             noise, groups, counts, weight, residual, self.flux_known, shared, self.left
         )
@@ -353,7 +368,7 @@ class Likelihood:
         return DataTerms(float(chi2), gradient, matrix, self.counted(data), of_errors.value)
 
     def expanded(self, values: Vector, terms: DataTerms, noise_scale: float, optics: OpticsUsed) -> Expansion:
-        """The expansion from the terms of the data."""
+        """The expansion that the terms of the data make together with the priors."""
         rows, select, pull = self.priors, self.model.selection(), self.priors.residuals(values)
         gradient = terms.gradient / noise_scale**2
         gradient[rows.index] += pull / rows.width
@@ -370,20 +385,20 @@ class Likelihood:
             noise_scale=noise_scale,
             gradient=select.T @ gradient,
             matrix=matrix,
-            census=terms.census,
-            dof=self._independent(terms.census) - round(taken_up),
+            used_data=terms.used_data,
+            dof=self._independent(terms.used_data) - round(taken_up),
             optics=optics,
             log_variance=terms.log_variance,
         )
 
-    def _independent(self, census: Census) -> int:
+    def _independent(self, used_data: UsedData) -> int:
         of_errors = np.isin(self.priors.index, self.model.positions(NOISE))
-        return round(float(census.rows @ self.data_per_row)) + int((self.priors.known & ~of_errors).sum())
+        return round(float(used_data.rows @ self.data_per_row)) + int((self.priors.known & ~of_errors).sum())
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
     def _joined(self, label: str, function: Callable[[engine.PointData], Joined]) -> Joined:
-        """Results of a function for each batch of points, joined."""
+        """The results of `function` for all batches of points, joined into one by their method `joined`."""
 
         def work(number: int) -> Joined:
             return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.part(number)))
@@ -391,23 +406,26 @@ class Likelihood:
         parts = self.runner.each(label, work, self.layout.points, self.layout.part)
         return functools.reduce(lambda a, b: a.joined(b), parts)
 
-    def counted(self, data: engine.PointData) -> Census:
-        """The census of some points."""
+    def counted(self, data: engine.PointData) -> UsedData:
+        """Number and field of the data of some points that are used."""
         used = np.asarray(data.weight)[..., 0] > 0
         x, y = (np.asarray(at)[used.any(axis=1)] for at in (data.x, data.y))
         low, high = np.inf, -np.inf
         field = (x.min(initial=low), x.max(initial=high), y.min(initial=low), y.max(initial=high))
-        return Census(used.sum(axis=0), tuple(map(float, field)), self.cameras)  # pyright: ignore[reportArgumentType]
+        return UsedData(used.sum(axis=0), tuple(map(float, field)), self.cameras)  # pyright: ignore[reportArgumentType]
 
     @cached_property
-    def census(self) -> Census:
-        """Census of the used rows of the set, by a separate pass; an expansion brings its own census with it."""
+    def used_data(self) -> UsedData:
+        """Number and field of the used data of the whole set, counted by a pass of its own.
+
+        An expansion has counted them on its way (`Expansion.used_data`).
+        """
         return self._joined("counting", self.counted)
 
     @property
     def independent(self) -> int:
-        """Number of independent data: those of every used row (`data_per_row`), and one per prior."""
-        return self._independent(self.census)
+        """Number of independent data: `data_per_row` of every used row, and one for each prior."""
+        return self._independent(self.used_data)
 
     @cached_property
     def used(self) -> Bool[np.ndarray, "p e"]:
@@ -444,7 +462,7 @@ class Likelihood:
         ratio = variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
         residual = self.with_errors_at(values).residuals(values)[1]
         light = np.where(weight > 0, counts * weight / np.sqrt(ratio) - residual, 0.0)
-        shared = engine.sharing(self.model.template, self.plan)
+        shared = engine.flux_groups(self.model.template, self.plan)
         return log_variance(ratio, light, self.flux_known, shared)
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
@@ -459,14 +477,14 @@ class Likelihood:
         return np.concatenate([used_rows(slope, batch) @ select for slope, batch in slopes])
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
-        """Stokes vectors that enter the instrument, per unit flux."""
+        """Stokes vectors (p, e, 4) of the light that enters the instrument, per unit of flux."""
         instrument = self.model.instrument(values)
         vectors = [engine.incoming(instrument, self.plan, batch) for batch in self.points]
         return np.concatenate(vectors)[: self.layout.points]
 
 
 def used_rows(columns: Array | np.ndarray, batch: engine.PointData) -> Float[np.ndarray, "d n"]:
-    """The rows of a batch that are used."""
+    """The rows of a batch whose intensities are used, of columns for all of its intensities."""
     used = np.asarray(batch.weight)[..., 0] > 0
     cube = np.asarray(columns).reshape(*used.shape, batch.weight.shape[-1], -1)
     return cube[used].reshape(-1, cube.shape[-1])

@@ -57,8 +57,8 @@ MEDIAN_RUN = 4096
 """Field points that are looked at together for the median."""
 NEIGHBOURS = 256
 """Points of a sample that lie side by side: a block of a table costs as much for one of them as for a row."""
-RUNS = (16, 128)
-"""Smallest and largest number of runs of neighbours in a sample: spread over the field, yet few to read."""
+BLOCKS = (16, 128)
+"""Smallest and largest number of blocks of neighbours in a sample: spread over the field, yet few to read."""
 
 # ------------------------------------------------------------------------------------------- after the fit
 

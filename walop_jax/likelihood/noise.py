@@ -6,7 +6,7 @@ Equations   −2 ln L = Σ r² + Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²),     r 
                 half the expected Hessian     2 c [Σ (1 − 2 ê²) α αᵀ + Σ_F (Σ ê² α) (Σ ê² α)ᵀ], and for a fraction f the
                                               slope over f as well where that is positive: only f² enters
 Symbols     N ± N_ERR a measured intensity, u the model for light of unit flux, F the flux, one for the intensities of a
-            group (`flux.Sharing`); sums over F run over these groups; where F is known there is none, and ê = 0
+            group (`flux.FluxGroups`); sums over F run over these groups; where F is known there is none, and ê = 0
             c  the fraction of the data that the other parameters leave (1: none of them takes up any)
 Meaning     The third term is what a flat prior on F leaves when F is integrated out. Without it s would come out too
             small by √(3/4) for four cameras with one flux: each flux takes up one datum. The same is true of all other
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from walop_jax.likelihood.flux import ALONE, Sharing, namespace
+from walop_jax.likelihood.flux import ALONE, FluxGroups, namespace
 from walop_jax.model.noise import ALL, Noise
 
 
@@ -49,7 +49,7 @@ class NoiseTerms(NamedTuple):
 
 
 def factors(noise: Noise, terms: NoiseTerms) -> tuple[Float[Any, "e k"], Float[Any, "e k"]]:
-    """s² and f² of every exposure and camera: σ² = s² N_ERR² + f² N². Numpy where the values of the terms are."""
+    """s² and f² of every exposure and camera (e, k): σ² = s² N_ERR² + f² N². Numpy in, numpy out."""
     xp = namespace(noise.scale, noise.fraction)
     scale, fraction = xp.asarray(noise.scale), xp.asarray(noise.fraction)
     squared = xp.prod(xp.where(xp.asarray(terms.scale) > 0, (scale**2)[:, None, None], 1.0), axis=0)
@@ -69,9 +69,9 @@ def log_variance(
     ratio: Float[Any, "*p e k"],
     light: Float[Any, "*p e k"],
     flux_known: Bool[Any, " e"],
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
 ) -> Float[Any, "*p e"]:
-    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²) of every row (point, exposure); of a flux of several rows each has its part.
+    """Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²) of every row (point, exposure); rows of one flux each have their part of it.
 
     `light` is a, of any common scale within a flux, 0 where unused.
     """
@@ -106,7 +106,7 @@ def noise_expansion(
     weight: Float[np.ndarray, "p e k"],
     residual: Float[np.ndarray, "p e k"],
     flux_known: Bool[np.ndarray, " e"],
-    shared: Sharing = ALONE,
+    shared: FluxGroups = ALONE,
     left: float = 1.0,
 ) -> NoiseExpansion:
     """The expansion at residuals r = (N − F u)/σ; `weight` is 1/N_ERR, `left` the c of the head of this file."""
@@ -131,7 +131,7 @@ def noise_expansion(
 
 
 def _parts(
-    light: Float[Any, "*p e k"], flux_known: Bool[Any, " e"], shared: Sharing
+    light: Float[Any, "*p e k"], flux_known: Bool[Any, " e"], shared: FluxGroups
 ) -> tuple[Float[Any, "*p e k"], Float[Any, "*p e f"]]:
     """ê² of every intensity, and Σ a² of its flux; both 0 where the flux is known or nothing is used."""
     xp = namespace(light)

@@ -5,10 +5,10 @@ derivative that anyone takes: the rows R of a point come with their slopes in th
 
     dR = Σ_o (∂R/∂θ_o) dθ_o
 
-whatever the number of directions dθ, exposures or cameras. Slopes are forward derivatives of `light.band_rows`, exact;
-parameters that no arm has in common share one, as a plate of the one half of the pupil leaves the rows of the other as
-they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Inst. Maths Applics 13, 117). Which
-parameter reaches which rows is found by following it through the operations, not declared.
+whatever the number of directions dθ, exposures or cameras. Slopes are forward derivatives of `light.band_rows`, exact.
+Parameters that change no row in common are differentiated together: a plate in one half of the pupil leaves the rows of
+the other half as they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Inst. Maths Applics 13,
+117). Which parameter reaches which rows is found by following it through the operations, not declared.
 
 Units       parameters in their units; field coordinates deg.
 Limits      all but parameters (field position, wavelengths, other arrays of the instrument) is differentiated
@@ -31,16 +31,17 @@ from walop_jax.model import light
 from walop_jax.model.compiled import derivatives
 from walop_jax.model.dependence import optical_reach
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import Scalar, Vector, values_of, with_values
+from walop_jax.model.parameters import ParameterVector, Scalar, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import series_indices
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions in which the rows are differentiated: parameter `index[o]` with others in direction `colour[o]`.
+    """Directions in parameter space along which the rows are differentiated.
 
-    `reached[o]` is True for the rows that the parameter changes.
+    Parameter `index[o]` belongs to direction `colour[o]`, together with other parameters that change none of its rows;
+    `reached[o]` is True for the rows that it changes.
     """
 
     index: Int[np.ndarray, " o"]
@@ -53,14 +54,16 @@ class Directions:
         return int(self.colour.max(initial=-1)) + 1
 
     def seeds(self, parameters: int) -> Float[np.ndarray, "c n"]:
-        """The directions as changes of all parameters."""
+        """The directions (c, n) as changes of all parameters, ones and zeros."""
         seeds = np.zeros((self.count, parameters))
         seeds[self.colour, self.index] = 1.0
         return seeds
 
 
 def directions(instrument: Instrument, plan: Plan) -> Directions:
-    """The fewest directions that a greedy choice gives; parameters that share one reach no row in common."""
+    """The directions for an instrument and a plan, as few as a greedy choice gives; parameters of one direction change
+    no row in common.
+    """
     reach = optical_reach(instrument, plan)
     rows = np.repeat(reach, [arm.analyser.rows for arm in instrument.arms], axis=0).T
     if light.is_dispersed(instrument):
@@ -77,7 +80,7 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
 
 
 def _slopes(
-    values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+    values: ParameterVector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
 ) -> tuple[Directions, light.Rows, Float[Array, "c b r 4"]]:
     """Band rows and their derivatives along `directions`."""
     along = directions(instrument, plan)
@@ -89,7 +92,9 @@ def _slopes(
 
 
 @jax.custom_jvp
-def band_rows(values: Vector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> light.Rows:
+def band_rows(
+    values: ParameterVector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
+) -> light.Rows:
     """Band rows (`light.band_rows`) at a field position (deg), of an instrument with these values of its parameters."""
     return light.band_rows(with_values(instrument)(values), plan, x, y)
 
@@ -99,7 +104,7 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
     along, rows, slopes = _slopes(values, *inputs)
     change = jnp.zeros_like(rows)
     if not isinstance(tangents[0], SymbolicZero):
-        # Share of every direction in the change of every row.
+        # The part of every direction in the change of every row.
         share = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
         share = share.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
         change = jnp.einsum("cr,cbrs->brs", share, slopes)
@@ -129,7 +134,7 @@ def rows_and_slopes(
 
 @jax.custom_jvp
 def with_slopes(
-    values: Vector,
+    values: ParameterVector,
     rows: Float[Array, "*m b r 4"],
     slopes: Float[Array, "o *m b r 4"],
     index: Int[Array, " o"],

@@ -17,10 +17,8 @@ from typing import TypeVar
 
 import jax
 
+from walop_jax.io.progress import Tell
 from walop_jax.model.compiled import float64, usual_threads
-
-Progress = Callable[[str], None]
-"""Receives a line on the progress of the work."""
 
 TOLD_EVERY = 1.0  # s
 
@@ -32,7 +30,7 @@ class Runner:
     """Runner of passes: its number of threads, and where progress is reported."""
 
     threads: int = dataclasses.field(default_factory=usual_threads)
-    progress: Progress | None = None
+    progress: Tell | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Parts that a copy in another process can use: progress is not reported from there."""

@@ -1,7 +1,7 @@
 """Other descriptions of an instrument: elements in another order or turned, left out, of another published dispersion.
 
 A change is a sentence and a function of the instrument. The sentences name places as `Instrument.changed` does. The
-list holds mistakes in the description, or in the assembly, of an instrument: none of them has a size. Changes without
+list holds errors in the description, or in the assembly, of an instrument: none of them has a size. Changes without
 effect on the light (of plates that commute) are listed too: the data decide.
 """
 
@@ -24,7 +24,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names
 
 Rearrangement = Callable[[Instrument], Instrument]
-Named = tuple[str, Rearrangement]
+NamedChange = tuple[str, Rearrangement]
 
 TURNS = (90.0, 180.0, 270.0)  # degrees
 JOINED = "; "
@@ -64,7 +64,7 @@ def changed(instrument: Instrument, sentence: str) -> Instrument:
 
 def _each_and_all(
     places: Sequence[str], what: str, change: Callable[[Instrument, str], Instrument]
-) -> Iterator[Named]:
+) -> Iterator[NamedChange]:
     """A change at each of the places, and at all of them together."""
     for place in places:
         yield f"{place} {what}", lambda instrument, place=place: change(instrument, place)
@@ -85,7 +85,7 @@ def _paths(instrument: Instrument) -> Iterator[tuple[str, str, tuple[str, ...]]]
     yield from ((arm.name, f"{arm.name}.", arm.path[:-1]) for arm in instrument.arms)
 
 
-def _layers(instrument: Instrument) -> Iterator[Named]:
+def _layers(instrument: Instrument) -> Iterator[NamedChange]:
     yield from _each_and_all(
         [place for place, plate in _used(instrument, WavePlate).items() if len(plate.layers) > 1],
         "with layers in the other order",
@@ -93,7 +93,7 @@ def _layers(instrument: Instrument) -> Iterator[Named]:
     )
 
 
-def _turned_plates(instrument: Instrument) -> Iterator[Named]:
+def _turned_plates(instrument: Instrument) -> Iterator[NamedChange]:
     turns: tuple[tuple[str, Callable[[Any], Any]], ...] = (
         ("turned by 90 deg", lambda axis: axis + 90.0),
         ("turned the other way", lambda axis: -axis),
@@ -102,7 +102,7 @@ def _turned_plates(instrument: Instrument) -> Iterator[Named]:
         yield f"{place} {what}", lambda i, place=place, turn=turn: i.changed(place, axis=turn)
 
 
-def _exchanged_plates(instrument: Instrument) -> Iterator[Named]:
+def _exchanged_plates(instrument: Instrument) -> Iterator[NamedChange]:
     """The plates of two arms, each in the place of the other: their axes are exchanged, all else is alike by design."""
     used = _used(instrument, WavePlate)
     of_arms = [place for place in used if "." in place]
@@ -117,7 +117,7 @@ def _exchanged_plates(instrument: Instrument) -> Iterator[Named]:
         yield f"{first} and {second} exchanged", exchange
 
 
-def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
+def _turned_wedges(instrument: Instrument) -> Iterator[NamedChange]:
     for turn in TURNS:
         yield from _each_and_all(
             [*_used(instrument, Wedge)],
@@ -128,7 +128,7 @@ def _turned_wedges(instrument: Instrument) -> Iterator[Named]:
         )
 
 
-def _beams(instrument: Instrument) -> Iterator[Named]:
+def _beams(instrument: Instrument) -> Iterator[NamedChange]:
     arms = instrument.arms
     yield from _each_and_all(
         [f"{arm.name}.{arm.analyser.name}" for arm in arms if len(arm.analyser.cameras) > 1],
@@ -151,7 +151,7 @@ def _with_cameras(instrument: Instrument, names: dict[str, tuple[str, ...]]) -> 
     return dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, arms=arms))
 
 
-def _order(instrument: Instrument) -> Iterator[Named]:
+def _order(instrument: Instrument) -> Iterator[NamedChange]:
     """Neighbours exchanged, behind the polariser and ahead of the analysers."""
     front = next((n for n, e in enumerate(instrument.train(), start=1) if isinstance(e, Polariser)), 0)
     for holder, prefix, path in _paths(instrument):
@@ -167,7 +167,7 @@ def _with_path(holder: str, path: Callable[[tuple[str, ...]], tuple[str, ...]]) 
     return lambda instrument: instrument.changed(holder, path=path)
 
 
-def _in_or_out(instrument: Instrument) -> Iterator[Named]:
+def _in_or_out(instrument: Instrument) -> Iterator[NamedChange]:
     for place, plate in _used(instrument, WavePlate).items():
         if plate.moves:
             what = (
@@ -189,7 +189,7 @@ def _in_or_out(instrument: Instrument) -> Iterator[Named]:
             yield f"{prefix}{name} left out", without
 
 
-def _dispersion(instrument: Instrument) -> Iterator[Named]:
+def _dispersion(instrument: Instrument) -> Iterator[NamedChange]:
     """All plates of a crystal with another published dispersion."""
     plates = _used(instrument, WavePlate)
     used = {layer.material for plate in plates.values() for layer in plate.layers}

@@ -34,7 +34,7 @@ SURE = 3.0  # standard deviations within which an instrument is built
 LARGEST_ANGLE = 4.0 * np.pi  # rad, of a number without a unit: two waves
 NANOMETRES = 3000.0  # above, wavelengths are taken for Angstrom
 
-Arm = tuple[str, tuple[Element, ...], tuple[str, ...]]
+ArmParts = tuple[str, tuple[Element, ...], tuple[str, ...]]
 Declared = tuple[tuple[str, Parameter], ...]
 
 
@@ -56,7 +56,7 @@ def with_origins(text: str, elements: Sequence[Element]) -> str:
 
 def parts(
     description: Description, elements: Sequence[type[Element]] = ()
-) -> tuple[tuple[Element, ...], tuple[Arm, ...], Throughput, Cameras]:
+) -> tuple[tuple[Element, ...], tuple[ArmParts, ...], Throughput, Cameras]:
     """The parts of a described instrument, at the values of the description.
 
     An arm is its name, its elements and their order. `elements` are further kinds of elements for the description.
@@ -80,7 +80,7 @@ def parts(
     return common, arms, series, _cameras(description, arms)
 
 
-def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
+def _cameras(description: Description, arms: Sequence[ArmParts]) -> Cameras:
     names, fault = description.cameras, description.read.fault
     beams = []
     for arm, elements, path in arms:
@@ -93,7 +93,7 @@ def _cameras(description: Description, arms: Sequence[Arm]) -> Cameras:
     cameras = [camera for beam in beams for camera in beam]
     if sorted(cameras) != list(range(len(names))):
         raise fault("cameras", f"every camera must be behind exactly one analyser: {', '.join(names)}")
-    return Cameras(names=names, arms=tuple(beams), split=description.split, floor=description.floor)
+    return Cameras(names=names, arms=tuple(beams), split=description.split, noise_floor=description.floor)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ class _Maker:
         where = line.removeprefix(made_by(kind))
         return f"It is {where}: give --elements FILE.py" if where else "One of your own: --elements FILE.py"
 
-    def arm(self, name: str, content: Any) -> Arm:
+    def arm(self, name: str, content: Any) -> ArmParts:
         place = f"arms.{self.read.name(name, 'arms')}"
         table = self.read.table(content, place)
         self.read.known(table, ("path", "elements"), place)
@@ -237,7 +237,7 @@ class _Maker:
                 if key == "wavelength":
                     self.check_wavelengths(values[key], key, place)
                 if key in SHARES and np.max(np.abs(values[key])) > 1.0:
-                    what = f"{key} = {values[key]:g} must be between 0 and 1 (a share, not per cent)"
+                    what = f"{key} = {values[key]:g} must be between 0 and 1 (a fraction, not per cent)"
                     raise self.read.fault(place, what)
             else:
                 raise self.read.fault(place, str(unknown_name("key", key, [*numbers, *plain])))

@@ -28,7 +28,7 @@ from walop_jax.model.conventions import FIELD_SCALE
 from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.sources import ExposureArrays, Scalar
 
-Places = Scalar | Float[Array, " e"]
+FieldCoordinate = Scalar | Float[Array, " e"]
 """Field coordinate (deg) of all exposures, or of each."""
 
 
@@ -45,7 +45,7 @@ class Throughput(Component):
         return {"coefficients": self.declared}
 
     def labels(self, field: str) -> Sequence[str]:
-        """Camera and exponents: n0.p21 is camera N0, second degree in X, first in Y."""
+        """Camera and degrees in X and Y: n0.p21 is the term of camera N0 of second degree in X and first in Y."""
         terms = legendre.terms(self.degree)
         return tuple(f"n{k}.p{i}{j}" for k in range(self.coefficients.shape[0]) for i, j in terms)
 
@@ -54,12 +54,12 @@ class Throughput(Component):
         return legendre.basis(x, y, self.degree, self.scale)
 
     def at(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """Throughput of the cameras at a field point."""
+        """Throughput (k) of the cameras at a field point (deg)."""
         return self.coefficients @ self.basis(x, y)
 
 
 class Transmission(Component):
-    """A factor of the throughput."""
+    """A factor of the throughput, such as the shadow of a grain of dust."""
 
     @abc.abstractmethod
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"] | Scalar:
@@ -67,23 +67,27 @@ class Transmission(Component):
 
 
 class Mixing(Component):
-    """A change of the analysis vectors behind the throughput."""
+    """A change of the analysis vectors behind the throughput, such as light of one camera in another."""
 
     @abc.abstractmethod
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-        """Analysis vectors (band, camera, Stokes) from those ahead of it."""
+        """The analysis vectors (band, camera, Stokes) with this change."""
 
 
 class GhostPart(Component):
-    """Light of the opposite field point."""
+    """Light of the opposite field point, reflected into the image."""
 
     @abc.abstractmethod
     def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        """Addition to the counts; `opposite` are those of the same source at (−X, −Y)."""
+        """Counts (e, k) to add; `opposite` are those of the same source at (−X, −Y), `extended` is true for light all
+        over the field.
+        """
 
 
 class ExposurePart(Component):
-    """Factors of the counts, or a share of the response to unpolarised light that is added, in some exposures."""
+    """Factors of the counts of single exposures, or a fraction of the response to unpolarised light that is added to
+    them.
+    """
 
     @property
     def exposures_known(self) -> int | None:
@@ -91,29 +95,30 @@ class ExposurePart(Component):
         return None
 
     def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
-        """Factors of the counts, exposure by exposure."""
+        """Factors (e, k) of the counts."""
         return 1.0
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
-        """The share, exposure by exposure."""
+        """Fractions (e, k) of the response to unpolarised light that are added."""
         return 0.0
 
 
 class DetectorPart(Component):
-    """Response of a detector to electrons."""
+    """The response of the detectors to electrons, such as a gain that depends on the counts."""
 
     @abc.abstractmethod
     def reported(
-        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: FieldCoordinate, y: FieldCoordinate
     ) -> Float[Array, "e k"]:
         """Reported counts for arriving counts (electrons) at a field point (deg), or at one for each row (e)."""
 
 
 class Cameras(Component):
-    """Names of the cameras, those of each arm (`arms`), and their parts beyond the throughput.
+    """Names of the cameras, the cameras of each arm (`arms`, by number), and their parts beyond the throughput.
 
-    `split`: the shares of the light in the arms are unknown and not smooth over the field, so that every arm has a flux
-    of its own (`likelihood.flux`). `floor`: no error is smaller than this share of the mean counts of a row.
+    `split`: the fractions of the light that go into the arms are unknown and not smooth over the field, so that every
+    arm has a flux of its own (`likelihood.flux`). `noise_floor`: no standard error is smaller than this fraction of the
+    mean counts of a row over the cameras (0.002 of WALOP-NORTH).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -124,19 +129,21 @@ class Cameras(Component):
     detectors: tuple[DetectorPart, ...] = ()
     arms: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
     split: bool = eqx.field(static=True, default=False)
-    floor: float = eqx.field(static=True, default=0.0)
+    noise_floor: float = eqx.field(static=True, default=0.0)
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def fluxes(self) -> int:
-        """Number of unknown fluxes of a row."""
+        """Number of unknown fluxes of a row: one, or one for each arm that is `split`."""
         return len(self.arms) if self.split else 1
 
     @property
-    def units(self) -> tuple[int, ...]:
-        """Reference cameras where only ratios can be measured: of `split` arms, of a single pair."""
+    def ratio_references(self) -> tuple[int, ...]:
+        """Reference cameras where only ratios of counts can be measured: the first of each `split` arm, or of a single
+        pair.
+        """
         alone = len(self.arms) == 1 and len(self.names) == 2
         return tuple(arm[0] for arm in self.arms) if self.split or alone else ()
 
@@ -147,7 +154,7 @@ class Cameras(Component):
 
     @property
     def together(self) -> Float[np.ndarray, "k k"] | None:
-        """1 for two cameras with a common flux; None: one flux for all."""
+        """Matrix (k, k) that is 1 for two cameras with a common flux; None if all cameras have one flux."""
         if not self.split:
             return None
         arm = np.zeros(len(self.names), int)
@@ -157,7 +164,7 @@ class Cameras(Component):
 
     @property
     def orthogonal(self) -> tuple[int, ...]:
-        """For each camera the one in the other beam of its analyser."""
+        """For each camera the number of the camera in the other beam of its analyser; its own number without one."""
         partners = list(range(len(self)))
         for a, b in self.pairs:
             partners[a], partners[b] = b, a
@@ -168,19 +175,21 @@ ALL_ORDERS = 4  # cameras up to which all orders are tried, beyond pairs alone
 
 
 def other_orders(count: int) -> list[tuple[int, ...]]:
-    """Orders in which so many cameras may have been written by mistake: all others, or of many cameras those with two
-    exchanged. Camera k is found at `order[k]`."""
+    """Orders in which `count` cameras may have been written by mistake; camera k is found at `order[k]`.
+
+    Of up to four cameras these are all other orders, of more cameras those with two exchanged.
+    """
     if count <= ALL_ORDERS:
         return list(itertools.permutations(range(count)))[1:]
     pairs = itertools.combinations(range(count), 2)
     return [tuple(b if k == a else a if k == b else k for k in range(count)) for a, b in pairs]
 
 
-def with_floor(
+def with_noise_floor(
     sigma: Float[np.ndarray, "p a b"],
     counts: Float[np.ndarray, "p a b"],
     floor: float | Float[np.ndarray, "*c"],
     cameras: int = 2,
 ) -> Float[np.ndarray, "p a b"]:
-    """Standard errors of counts, none smaller than `Cameras.floor` allows; `cameras` is the axis of these."""
+    """Standard errors of counts, none smaller than `floor` × the mean counts over the axis `cameras`."""
     return sigma if not np.any(floor) else np.maximum(sigma, floor * counts.mean(axis=cameras, keepdims=True))

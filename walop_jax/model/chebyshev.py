@@ -6,7 +6,7 @@ Series      f(t) ≈ Σ_k c_k T_k(t), c_k = (2 − δ_k0)/n · Σ_j T_k(t_j) f(t
 Source      Trefethen 2013, Approximation Theory and Approximation Practice, chapters 2–4 and 8: for a function that
             is analytic in a neighbourhood of the rectangle the error falls geometrically with n.
 
-Arrays of numpy stay arrays of numpy, those of jax stay theirs.
+Arrays of numpy give arrays of numpy, arrays of JAX give arrays of JAX.
 """
 
 from __future__ import annotations

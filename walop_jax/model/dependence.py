@@ -4,7 +4,7 @@
 parameter through the operations of `light.band_rows`: those that reach the result enter before the band integral.
 
 Not all of an instrument is valid for exposures other than the fitted ones. The instrument matrix and the analysis of a
-catalogue use the optics and the cameras. Light of the opposite field point, shares of single exposures, optics that
+catalogue use the optics and the cameras. Light of the opposite field point, changes of single exposures, optics that
 change with the time since the first exposure and detectors that depend on their exposure do not carry over; the
 response of a detector to its own counts, which may differ over the field, is inverted. Patching shows the effects
 concerned; they are not declared.
@@ -32,14 +32,14 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import by_shapes, parameter_places
 from walop_jax.model.plan import Plan, blank_plan
 from walop_jax.model.ray import SMOOTH, NotPlannedError, Ray
-from walop_jax.model.sources import ExposureArrays, Sight
+from walop_jax.model.sources import ExposureArrays, PointIllumination
 
 AT = 0.11, 0.07
 """A field point off the axis and at an odd place: no dependence may vanish by symmetry."""
 
 
 class Needs(NamedTuple):
-    """Requirements of a light path: conditions of the optics, median counts, fringes that nodes must follow."""
+    """Requirements on a plan: conditions of the optics, median counts, fringes that nodes must follow."""
 
     conditions: frozenset[str]
     smooth: frozenset[str]  # those on which the optics depend smoothly
@@ -57,8 +57,8 @@ def needs(instrument: Instrument) -> Needs:
         x, y = map(jnp.asarray, AT)
         rows = light.band_rows(patched, plan, x, y)
         zeros = jnp.zeros_like(plan.exposures.kind)
-        sight = Sight(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
-        counts = light.counts(patched, rows, patched.throughput.at(x, y), sight, zeros)
+        illumination = PointIllumination(plan.exposures, jnp.zeros((*zeros.shape, 2)), zeros - 1, x, y)
+        counts = light.counts(patched, rows, patched.throughput.at(x, y), illumination, zeros)
         return patched, light.detected(patched, plan.exposures, counts, x, y)
 
     (patched, _), quantities = _asking(run, instrument)
@@ -68,7 +68,7 @@ def needs(instrument: Instrument) -> Needs:
 
 
 def _asking(run: Callable[[Set[str], Any], Any], of: Any) -> tuple[Any, frozenset[str]]:
-    """Shapes of a computation with all quantities that it asks for, and their names."""
+    """The shapes of the result of a computation, and the names of all quantities that it asks for on the way."""
     quantities: frozenset[str] = frozenset()
     while True:
         try:
@@ -155,7 +155,9 @@ class _Unknown(ExposureArrays):
 
 
 def is_undone(part: DetectorPart, cameras: int) -> bool:
-    """True for a detector that depends on its own counts and the field, so that catalogues can be corrected for it."""
+    """True for a detector that depends only on its own counts and the field point, so that catalogues can be corrected
+    for it.
+    """
     counts, at = jnp.ones((1, cameras)), tuple(map(jnp.asarray, AT))
     try:
         jax.eval_shape(lambda p: p.reported(counts, blank(_Unknown), *at), part)

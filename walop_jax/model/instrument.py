@@ -85,7 +85,7 @@ class Instrument(LightPath):
 
     @property
     def units(self) -> Units:
-        """Scales of changes over its field and its bands."""
+        """The scales of this instrument, in which changes over its field (deg) and its bands (µm) are counted."""
         return Units(self.throughput.scale, self.wavelength)
 
     def mueller(
@@ -96,13 +96,14 @@ class Instrument(LightPath):
         angles: Mapping[str, float] | None = None,
         **conditions: Any,
     ) -> Float[Array, "k *w 4 4"]:
-        """Mueller matrices of the light path of every camera, behind the polariser and ahead of its analyser.
+        """Mueller matrices (camera, wavelength, 4, 4) of the light path behind the polariser and ahead of the
+        analysers.
 
-        Differentiable in field position (deg), wavelength (µm) and the numbers of the instrument. `angles` (deg) are
-        those of moving elements in the beam, by the prefix of their columns ({"CHWP": 45.0}); the others are out.
-        `conditions` are the relevant ones of `ray.CONDITIONS` (temperature in Celsius, hour_angle in h).
-        Raises ValueError for an unknown moving element, `NotPlannedError` for a missing condition, and RuntimeError
-        when float64 is switched off.
+        The first call compiles a program, which takes some seconds; further calls take milliseconds. Differentiable in
+        field position (deg), wavelength (µm) and the numbers of the instrument. `angles` (deg) are the angles of moving
+        elements in the beam, by the prefix of their columns ({"CHWP": 45.0}); the others are out. `conditions` are the
+        relevant ones of `ray.CONDITIONS` (temperature in Celsius, hour_angle in h). Raises ValueError for an unknown
+        moving element, `NotPlannedError` for a missing condition, and RuntimeError when float64 is switched off.
         """
         need_float64("the Mueller matrix")
         instrument, angles = self.patched(), dict(angles or {})
@@ -115,7 +116,7 @@ class Instrument(LightPath):
         )
         state = tuple(angles.get(prefix) for prefix in moving)
         path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, moving, [state])
-        ahead, *inside = path.in_first_state()
+        ahead, *inside = path.in_first_setting()
         of_arm = []
         for behind in inside:
             matrix = fold.product((*ahead, *behind))
@@ -196,7 +197,7 @@ def nominal_instrument(name: str | None = None, **options: Any) -> Instrument:
 
 
 def sources() -> tuple[Source, ...]:
-    """The sources of every instrument."""
+    """The sources that every instrument has: moonlit sky, standards, light through the polariser, lamps, known flux."""
     return tuple(_standards(()) if kind is Standards else kind() for kind in SOURCES)
 
 

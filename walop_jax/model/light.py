@@ -31,7 +31,7 @@ from walop_jax.model.elements.simple import Analyser
 from walop_jax.model.light_path import LightPath, Scalar, is_achromatic
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import Ray
-from walop_jax.model.sources import ExposureArrays, Sight, Source, turned
+from walop_jax.model.sources import ExposureArrays, PointIllumination, Source, turned
 
 Rows = Float[Array, "b r 4"]  # band, row of an analyser, Stokes
 Vectors = Float[Array, "b k 4"]  # band, camera, Stokes
@@ -46,10 +46,10 @@ BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `Light
 
 
 def divided(instrument: LightPath) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
-    """The common train behind the polariser: leading elements, then those in the band integral.
+    """The common train behind the polariser in two parts: its leading elements, and those in the band integral.
 
-    Leading are the elements up to the first that moves, or that depends on the wavelength or on another quantity of
-    the exposures, as a run on shapes shows.
+    Leading are all elements ahead of the first one that moves or that depends on the wavelength or on another quantity
+    of the exposures; which ones do is found by running them on shapes.
     """
     behind = instrument.behind_polariser()
     leading = tuple(itertools.takewhile(lambda e: not e.moves and is_achromatic(e), behind))
@@ -99,7 +99,9 @@ def band_weights(instrument: LightPath, plan: Plan) -> Float[Array, "b n"]:
 
 
 def weights_at(plan: Plan, wavelength: Float[Array, " n"], teff: Float[Array, " b"]) -> Float[Array, "b n"]:
-    """As `band_weights`, for other wavelengths of the nodes and colour temperatures of the bands; no slopes."""
+    """The same as `band_weights`, at other wavelengths of the nodes and colour temperatures of the bands, without
+    slopes.
+    """
     hot = teff > 0
     exponent = 14387.77 / (wavelength * jnp.where(hot, teff, 5000.0)[:, None])
     spectrum = jnp.where(hot[:, None], wavelength**-4 / jnp.expm1(exponent), 1.0)
@@ -128,7 +130,7 @@ def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Rows:
         leading, banded = divided(instrument)
         for element in leading:
             ray = element.ray(ray)
-        path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.states)
+        path = fold.Fold.of(banded, instrument.arms, ray, plan.moving, plan.positions)
         return path.backward(path.solved(), len(plan.wavelength))
 
     rows = with_dispersion(instrument, at, wavelength)
@@ -184,7 +186,7 @@ def camera_vectors(instrument: LightPath, rows: Rows, throughput: Shares, x: Sca
 
 
 def beams(instrument: LightPath, rows: Rows) -> Vectors:
-    """Rows of the cameras: shares of each beam in the rows of its analyser."""
+    """Rows (band, camera, 4) of the cameras: each beam adds the rows of its analyser with its weights."""
     index, shares = _beams(instrument)
     contributions = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
     return functools.reduce(jnp.add, contributions)
@@ -203,7 +205,7 @@ def behind_throughput(
 
 
 def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, "k j"]]:
-    """For each camera the rows of its beam, and its share of each."""
+    """For each camera the rows that its beam is made of, and the weight of each."""
     analysers = [arm.analyser for arm in instrument.arms]
     names = [name for analyser in analysers for name in analyser.cameras]
     order = np.array([names.index(name) for name in instrument.cameras.names])
@@ -214,9 +216,9 @@ def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, 
             for start, a in zip(first, analysers, strict=False)
         ]
     )
-    shares = jnp.concatenate([analyser.shares() for analyser in analysers])
+    shares = jnp.concatenate([analyser.beam_weights() for analyser in analysers])
     if is_dispersed(instrument):
-        slopes = jnp.concatenate([analyser.shares_of_slopes() for analyser in analysers])
+        slopes = jnp.concatenate([analyser.beam_weights_of_slopes() for analyser in analysers])
         index, shares = np.concatenate([index, first[-1] + index], 1), jnp.concatenate([shares, slopes], 1)
     return index[order], shares if (order == np.arange(len(order))).all() else shares[order]
 
@@ -224,80 +226,100 @@ def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, 
 # ----------------------------------------------------------------------------------------- light and counts
 
 
-def stokes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
-    """Stokes vectors behind the place of the polariser, one per exposure, at a field point.
+def stokes(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
+    """Stokes vectors (e, 4) of the light behind the place of the polariser, one for each exposure, at a field point.
 
-    Light through the polariser keeps no memory of its source; only light from the sky passes the telescope.
+    Light behind the polariser is independent of its source; only light from the sky passes the telescope.
     """
     instrument = instrument.patched()
-    exposures, x, y = sight.exposures, sight.x, sight.y
-    sight = _turned(instrument, sight)
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
+    illumination = _turned(instrument, illumination)
     assigned = jnp.zeros(exposures.kind.shape, bool)
     qu = jnp.zeros((*assigned.shape, 2))
     for source in instrument.sources:
         if type(source).polarisation is not Source.polarisation:
-            shining = source.shines(sight) & ~assigned
-            qu, assigned = jnp.where(shining[:, None], source.polarisation(sight), qu), assigned | shining
-    light = _at_polariser(instrument, sight, jnp.ones_like(exposures.clp_angle), qu)
+            shining = source.shines(illumination) & ~assigned
+            qu, assigned = (
+                jnp.where(shining[:, None], source.polarisation(illumination), qu),
+                assigned | shining,
+            )
+    light = _at_polariser(instrument, illumination, jnp.ones_like(exposures.clp_angle), qu)
     polariser = instrument.polariser
     if polariser is None:
         return light
     return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
 
 
-def stokes_slopes(instrument: LightPath, sight: Sight) -> Float[Array, "e 4"]:
+def stokes_slopes(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
     """Change of the Stokes vectors with wavelength (per µm) inside a band, for the colours of standards."""
     instrument = instrument.patched()
-    exposures, sight = sight.exposures, _turned(instrument, sight)
+    exposures, illumination = illumination.exposures, _turned(instrument, illumination)
     dark = jnp.zeros_like(exposures.clp_angle)
-    light = _at_polariser(instrument, sight, dark, instrument.standard.slope(sight))
+    light = _at_polariser(instrument, illumination, dark, instrument.standard.slope(illumination))
     return jnp.where(exposures.clp_in[:, None], 0.0, light)
 
 
 def _at_polariser(
-    instrument: LightPath, sight: Sight, intensity: Float[Array, " e"], qu: Float[Array, "e 2"]
+    instrument: LightPath,
+    illumination: PointIllumination,
+    intensity: Float[Array, " e"],
+    qu: Float[Array, "e 2"],
 ) -> Float[Array, "e 4"]:
-    """Light of an intensity and polarisation behind the telescope and the films of light from the sky."""
-    exposures, x, y = sight.exposures, sight.x, sight.y
+    """Stokes vectors (e, 4) of light of given intensity and polarisation, behind the telescope and the films of light
+    from the sky.
+    """
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
     light = jnp.stack([intensity, qu[:, 0], qu[:, 1], jnp.zeros_like(intensity)], axis=-1)
     if instrument.telescope():
-        light = jnp.where(indoors(instrument, sight)[:, None], light, light @ telescope(instrument, x, y).T)
+        light = jnp.where(
+            bypasses_telescope(instrument, illumination)[:, None],
+            light,
+            light @ telescope(instrument, x, y).T,
+        )
     for film in instrument.sky_films:
-        light = jnp.where(indoors(instrument, sight)[:, None], light, film.through(light, exposures, x, y))
+        light = jnp.where(
+            bypasses_telescope(instrument, illumination)[:, None], light, film.through(light, exposures, x, y)
+        )
     return light
 
 
-def indoors(instrument: LightPath, sight: Sight) -> Bool[Array, " e"]:
-    """True for light that enters behind the telescope."""
-    sources = (source.shines(sight) for source in instrument.sources if not source.facts.from_sky)
-    return functools.reduce(jnp.logical_or, sources, jnp.zeros(sight.source.shape, bool))
+def bypasses_telescope(instrument: LightPath, illumination: PointIllumination) -> Bool[Array, " e"]:
+    """True (e) in exposures whose light enters behind the telescope: lamps, the light of an optical design program."""
+    sources = (source.shines(illumination) for source in instrument.sources if not source.facts.from_sky)
+    return functools.reduce(jnp.logical_or, sources, jnp.zeros(illumination.source.shape, bool))
 
 
-def _turned(instrument: LightPath, sight: Sight) -> Sight:
-    """Sight with the true position angle of the instrument."""
+def _turned(instrument: LightPath, illumination: PointIllumination) -> PointIllumination:
+    """The illumination with ROTATOR and sky turned by `rotator_zero`: the true position angle of the instrument."""
     if instrument.rotator_zero is None:
-        return sight
+        return illumination
     offset = jnp.deg2rad(instrument.rotator_zero)
-    exposures = eqx.tree_at(lambda e: e.rotator, sight.exposures, sight.exposures.rotator + offset)
-    sky = turned(sight.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
-    return sight._replace(exposures=exposures, sky=sky)
+    exposures = eqx.tree_at(
+        lambda e: e.rotator, illumination.exposures, illumination.exposures.rotator + offset
+    )
+    sky = turned(illumination.sky, jnp.broadcast_to(offset, exposures.rotator.shape))
+    return illumination._replace(exposures=exposures, sky=sky)
 
 
 def counts(
-    instrument: LightPath, rows: Rows, throughput: Shares, sight: Sight, band: Int[Array, " e"]
+    instrument: LightPath,
+    rows: Rows,
+    throughput: Shares,
+    illumination: PointIllumination,
+    band: Int[Array, " e"],
 ) -> Counts:
-    """Counts of the cameras in every exposure at a field point, for light of unit flux and no ghosts."""
+    """Counts (e, k) of the cameras in every exposure at a field point, for light of unit flux, without ghosts."""
     instrument = instrument.patched()
-    exposures, x, y = sight.exposures, sight.x, sight.y
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
     vectors = camera_vectors(instrument, rows, throughput, x, y)
-    light = stokes(instrument, sight)
+    light = stokes(instrument, illumination)
     if len(vectors) <= FEW_BANDS:  # a matrix product: indexing would copy the vectors for every exposure
         in_band = jax.nn.one_hot(band, len(vectors), dtype=light.dtype)
         result = jnp.einsum("bks,eb,es->ek", vectors, in_band, light)
     else:
         result = jnp.einsum("eks,es->ek", vectors[band], light)
     if exposures.slope_band is not None:
-        slopes = stokes_slopes(instrument, sight)
+        slopes = stokes_slopes(instrument, illumination)
         result = result + jnp.einsum("eks,es->ek", vectors[exposures.slope_band], slopes)
     for gain in instrument.cameras.exposures:
         result = result * gain.factors(exposures, x, y)
@@ -311,7 +333,7 @@ def has_ghosts(instrument: LightPath) -> bool:
 
 
 def with_ghosts(instrument: LightPath, counts: Counts, opposite: Counts, source: Int[Array, " e"]) -> Counts:
-    """Counts for light of unit flux with ghosts of those at the opposite field point, `opposite`."""
+    """Counts (e, k) for light of unit flux, with the ghosts of the counts at the opposite field point (`opposite`)."""
     for ghost in instrument.patched().cameras.ghosts:
         counts = counts + ghost.seen(source < 0, opposite)
     return counts
@@ -325,7 +347,7 @@ def is_linear(instrument: LightPath) -> bool:
 def detected(
     instrument: LightPath, exposures: ExposureArrays, counts: Counts, x: Scalar, y: Scalar
 ) -> Counts:
-    """Counts reported by the detectors for counts in electrons: the only stage non-linear in the light."""
+    """Counts (e, k) reported by the detectors for counts in electrons: the only stage not linear in the light."""
     for detector in instrument.patched().cameras.detectors:
         counts = detector.reported(counts, exposures, x, y)
     return counts
@@ -337,10 +359,11 @@ def detected(
 def instrument_matrix(
     vectors: Float[Any, "... k s"], pairs: tuple[tuple[int, int], ...]
 ) -> Float[Any, "... a 3"]:
-    """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix from analysis vectors, one for each arm.
+    """Rows (m21, m22, m23), (m31, m32, m33), … of the instrument matrix (arm, 3) from analysis vectors (camera, s).
 
-    Difference of the response of the cameras of an arm of two (`pairs`) to 1, q, u, each over the sum of that to
-    unpolarised light. For light from the sky pass `vectors @ telescope(instrument, x, y)`. Arrays of numpy stay so.
+    The two cameras of an arm (`pairs`) respond to 1, q and u: each element is the difference of their responses over
+    the sum of their responses to unpolarised light. For light from the sky pass `vectors @ telescope(instrument, x,
+    y)`. Arrays of numpy stay arrays of numpy.
     """
     first, second = (vectors[..., np.array([pair[i] for pair in pairs], int), :] for i in (0, 1))
     return (first[..., :3] - second[..., :3]) / (first[..., :1] + second[..., :1])

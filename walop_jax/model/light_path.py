@@ -31,24 +31,27 @@ AnyPart = TypeVar("AnyPart", bound=Component)
 
 
 class NoSuchPlaceError(ValueError):
-    """An effect on an element that this instrument does not have."""
+    """A change or an effect names an element, camera or source that this instrument does not have."""
 
 
 class Arm(Component):
-    """Light path of one part of the pupil; `path` names its elements in the order light meets them."""
+    """Light path of one part of the pupil; `path` names its elements in the order in which light meets them.
+
+    The last one is the analyser, behind which the cameras of the arm stand.
+    """
 
     name: str = eqx.field(static=True)
     elements: tuple[Element, ...]
     path: tuple[str, ...] = eqx.field(static=True)
 
     def train(self) -> Iterator[Element]:
-        """Its elements ahead of the analyser, in the order light meets them."""
+        """The elements of the arm ahead of its analyser, in the order in which light meets them."""
         for name in self.path[:-1]:
             yield _member(self.elements, name, f"element of arm {self.name}")
 
     @property
     def analyser(self) -> Analyser:
-        """Its last element."""
+        """The last element of the arm."""
         last = _member(self.elements, self.path[-1], f"element of arm {self.name}")
         if not isinstance(last, Analyser):
             raise ValueError(f"arm {self.name}: its path must end with an analyser, not with {last.name!r}")
@@ -56,9 +59,10 @@ class Arm(Component):
 
 
 class LightPath(Component):
-    """All optics, sources and cameras of a fit. `path` names the elements ahead of the arms in their order.
+    """All sources, optics and cameras of a fit; `path` names the elements ahead of the arms in their order.
 
-    `rotator_zero` (deg) is added to ROTATOR, `filter_shift` (µm) displaces broad bands; None: none.
+    `rotator_zero` (deg) is added to ROTATOR; `filter_shift` (µm) displaces broad bands; None stands for no such change.
+    `effects` are not applied yet: `patched` returns the light path with their changes.
     """
 
     name: str = eqx.field(static=True)
@@ -109,14 +113,14 @@ class LightPath(Component):
 
     @property
     def standard(self) -> Standards:
-        """The standard stars."""
+        """The source `standard` of the light path: its standard stars."""
         source = _member(self.sources, Standards.name, "source")
         assert isinstance(source, Standards)
         return source
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """KINDs of exposures of its sources."""
+        """The KINDs of exposures that its sources can shine in."""
         return tuple(source.kind for source in self.sources)
 
     def element(self, place: str) -> Element:
@@ -143,6 +147,11 @@ class LightPath(Component):
         elements = (e for e in self.ahead_of_analysers() if not isinstance(e, Polariser))
         return tuple(dict.fromkeys(element.moves for element in elements if element.moves))
 
+    def reading_in_words(self, prefix: str, reading: float) -> str:
+        """A reading of the elements that move as `prefix`, with their unit: 45°, 5 V, or the number alone."""
+        words = {e.reading_in_words(reading) for e in self.ahead_of_analysers() if e.moves == prefix}
+        return words.pop() if len(words) == 1 else f"{reading:g}"
+
     def within_period(self, prefix: str, readings: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Readings of the elements that move together as `prefix`, reduced to one period (`Element.period`).
 
@@ -165,7 +174,7 @@ class LightPath(Component):
     # ------------------------------------------------------------------------------- changing it
 
     def patched(self) -> Self:
-        """The instrument with the changes of its effects, which are removed."""
+        """The instrument with the changes of its effects made, and without the effects themselves."""
         bare = dataclasses.replace(self, effects=())
         return functools.reduce(lambda instrument, effect: effect.patch(instrument), self.effects, bare)
 
@@ -195,12 +204,13 @@ class LightPath(Component):
         elements = (*holder.elements, dataclasses.replace(element, name=name))
         return self.changed(where, elements=elements, path=(*holder.path[:at], name, *holder.path[at:]))
 
-    def with_part(self, slot: str, part: Component) -> Self:
+    def with_part(self, stage: str, part: Component) -> Self:
         """The instrument with one more part of its cameras.
 
-        `slot` is "transmission", "mixing", "ghosts", "exposures" or "detectors".
+        `stage` is the stage of the cameras at which it acts: "transmission", "mixing", "ghosts", "exposures" or
+        "detectors".
         """
-        cameras = dataclasses.replace(self.cameras, **{slot: (*getattr(self.cameras, slot), part)})
+        cameras = dataclasses.replace(self.cameras, **{stage: (*getattr(self.cameras, stage), part)})
         return dataclasses.replace(self, cameras=cameras)
 
     def with_source(self, source: Source) -> Self:

@@ -1,7 +1,7 @@
 """Refractive indices of the glasses and crystals in the light path.
 
 Equations   Sellmeier formula 1, n² = 1 + Σ B λ²/(λ² − C²) (Dodge, Radhakrishnan; Li with a constant), and formula 2,
-            n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic mistake; `_formula_1` marks
+            n² = A + Σ B λ²/(λ² − C) (Schott, Ghosh). Mixing the two up is the classic error; `_formula_1` marks
             the first.
 Symbols     λ vacuum wavelength [µm]; n refractive index; A, B dimensionless; C [µm] in formula 1, [µm²] in 2.
 Sources     beside the numbers; the curves as transcribed in the refractiveindex.info database. They were measured at
@@ -62,7 +62,7 @@ MGF2_THERMAL = 5.37e-5
 REFERENCE_TEMPERATURE = 10.0  # Celsius
 
 
-EXTRAPOLATED = 1.25
+EXTRAPOLATED = 1.25  # times beyond the measured wavelengths up to which an index is used, with a remark
 
 
 class Crystal(NamedTuple):
@@ -83,7 +83,7 @@ class Crystal(NamedTuple):
 
 
 class Glass(NamedTuple):
-    """An isotropic material; `measured` as of a crystal."""
+    """An isotropic material; `measured` is the range of wavelengths (µm) to which its curve was fitted."""
 
     dispersion: Sellmeier
     measured: tuple[float, float]

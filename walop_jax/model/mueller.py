@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
-Scalar = Float[Array, "..."]
+Real = Float[Array, "..."]
 Matrix2 = Inexact[Array, "2 2 ..."]
 
 computed_once = jax.lax.optimization_barrier
-"""Values that XLA is to compute once: by itself it computes a cheap one in every loop that asks for it, and cheap ones
-from cheap ones grow to loops of a thousand operations, compiled as often as there are elements of a matrix."""
+"""Marks values that XLA is to compute once. By itself XLA repeats a cheap computation in every loop that uses its
+result; cheap results made of cheap results then grow to loops of a thousand operations, which are compiled as often as
+a matrix has elements."""
 
 
 def matrix2(*elements: Inexact[Array, ...]) -> Matrix2:
@@ -40,12 +41,16 @@ def inverse2(matrix: Matrix2) -> Matrix2:
     return computed_once(sign * k * matrix[::-1, ::-1].swapaxes(0, 1))
 
 
-def _matrix(*rows: tuple[Scalar, ...]) -> Float[Array, "... 4 4"]:
+def _matrix(*rows: tuple[Real, ...]) -> Float[Array, "... 4 4"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def product(matrices: Iterable[Float[Array, "... 4 4"] | None]) -> Float[Array, "... 4 4"] | None:
-    """Product of Mueller matrices in the order of the light path; None: the identity."""
+    """Product of Mueller matrices given in the order in which light meets the elements; None among them is the
+    identity.
+
+    None comes back if all of them are None.
+    """
     result = None
     for matrix in matrices:
         if matrix is not None:
@@ -61,7 +66,7 @@ def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     """
     (a, b), (c, d) = jones
 
-    def power(z: Inexact[Array, ...]) -> Scalar:
+    def power(z: Inexact[Array, ...]) -> Real:
         return z.real**2 + z.imag**2
 
     aa, bb, cc, dd = power(a), power(b), power(c), power(d)
@@ -76,7 +81,7 @@ def from_jones(jones: Matrix2) -> Float[Array, "... 4 4"]:
     )
 
 
-def diattenuator(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, "... 4 4"]:
+def diattenuator(q: Real, u: Real, v: Real | float = 0.0) -> Float[Array, "... 4 4"]:
     """Non-depolarising diattenuator of unit mean transmission with diattenuation vector (q, u, v).
 
     M = [[1, Dᵀ], [D, √(1−D²) 1 + (1 − √(1−D²)) D̂D̂ᵀ]] (Lu & Chipman 1996, eq. 18); identity for D = 0. The
@@ -93,7 +98,7 @@ def diattenuator(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, 
     )
 
 
-def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
+def retarder(delta: Real, axis: Real) -> Float[Array, "... 4 4"]:
     """Linear retarder of retardance `delta` with its fast axis at `axis` (both rad).
 
     Paper II, appendix B, general retarder matrix; identity for delta = 0.
@@ -110,7 +115,7 @@ def retarder(delta: Scalar, axis: Scalar) -> Float[Array, "... 4 4"]:
     )
 
 
-def rotation(angle: Scalar) -> Float[Array, "... 4 4"]:
+def rotation(angle: Real) -> Float[Array, "... 4 4"]:
     """Stokes parameters referred to axes turned by `angle` (rad): the matrix M_rot(angle) of Paper II."""
     c2, s2 = jnp.cos(2 * angle), jnp.sin(2 * angle)
     ones, zeros = jnp.ones_like(c2), jnp.zeros_like(c2)
@@ -122,7 +127,7 @@ def rotation(angle: Scalar) -> Float[Array, "... 4 4"]:
     )
 
 
-def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"]:
+def polarised(angle: Real, extinction: Real | float) -> Float[Array, "... 4"]:
     """Stokes vector behind a polariser with its axis at `angle` (rad), per unit of transmitted light.
 
     (1, c cos 2θ, c sin 2θ, 0) with c = (1 − ε)/(1 + ε), ε the extinction ratio.
@@ -132,7 +137,7 @@ def polarised(angle: Scalar, extinction: Scalar | float) -> Float[Array, "... 4"
     return jnp.stack([jnp.ones_like(two), c * jnp.cos(two), c * jnp.sin(two), jnp.zeros_like(two)], axis=-1)
 
 
-def general_retarder(q: Scalar, u: Scalar, v: Scalar | float = 0.0) -> Float[Array, "... 4 4"]:
+def general_retarder(q: Real, u: Real, v: Real | float = 0.0) -> Float[Array, "... 4 4"]:
     """Elliptical retarder of retardance vector (q, u, v) (rad): the Poincaré sphere turned about it by its length.
 
     M = 1 + s A + c A², A the cross product with the vector r, s = sin Δ/Δ, c = (1 − cos Δ)/Δ², Δ = |r|; smooth at 0.

@@ -1,9 +1,14 @@
 """Parameters with unit, meaning, source and prior; their names follow from their tree.
 
-`Parameter` is the only record of a number. A component declares its numbers in two ways. `param` declares a permanent
-parameter of every instance. `number` declares a number that an instrument may keep fixed; its description lists the
-parameters among them, with prior and source (`Element.declared`). There is no second list of names: they follow from
-the tree. The value in the tree has the unit of the declaration (e.g. um or deg), conversions are part of the equations.
+`Parameter` is the only record of a number. A component declares its numbers in one of three ways:
+
+    param     a permanent parameter of every instance: δ of the moonlit sky, the amplitude of an effect
+    number    a number that is a parameter only if the description of the instrument says so: thickness of a plate
+    row       several numbers of that kind in one array: the values of a curve over wavelength
+
+The description lists the parameters among the numbers, with prior and source (`Element.declared`). There is no second
+list of names: names follow from the tree. The value in the tree has the unit of the declaration (um or deg, for
+example), and conversions are part of the equations.
 """
 
 from __future__ import annotations
@@ -28,7 +33,7 @@ PARAMETER = "walop_jax.parameter"
 NUMBER = "walop_jax.number"
 SEVERAL = "walop_jax.several"
 
-Vector = Float[Array, " n"]
+ParameterVector = Float[Array, " n"]
 Scalar = Float[Array, ""]
 NAME = re.compile(r"[A-Za-z0-9_.+*-]+")
 """Valid names of parameters, in models and in files."""
@@ -39,15 +44,16 @@ Result = TypeVar("Result")
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One number of an instrument: name, prior knowledge, freedom.
+    """One number of an instrument: its name, what is known of it beforehand, and whether a fit varies it.
 
-    `prior` is (mean, standard deviation) or None, `scale` the natural step of a solver, `loose` the width of a very
-    weak pull toward `start`, which bounds poorly determined combinations and is no prior knowledge; `tie` is the name
-    of the parameter that sets its value. `part` is the place of its component, as for `Instrument.changed`:
-    "half1.plate", "throughput", "sky", or the name of an effect.
+    `prior` is (mean, standard deviation) or None; `scale` the natural step of a solver; `loose` the width of a weak
+    pull toward `start`, which bounds combinations that the data hardly see and is no prior knowledge; `tie` the name of
+    the parameter whose value this one takes. `part` is the component, as for `Instrument.changed`: "half1.plate",
+    "throughput", "sky", or the name of an effect. All are in `unit`.
 
-    Before a number has a value (`declared`), the mean of its prior is relative to that value, the step may be 0 (then
-    it follows from the prior or the value), and a name replaces that of the tree.
+    A number is `declared` before it has a value. The mean of its prior is then relative to the value that comes: ±0.3
+    about the measured angle. Its `scale` may be 0, and follows from the prior or the value. A `name` that is given
+    replaces the name that the tree would give: `pupil.magnification` for the magnification of the element `pupil`.
     """
 
     name: str
@@ -68,12 +74,12 @@ class Parameter:
         return None if self.prior is None else self.prior[1]
 
     @property
-    def state(self) -> str:
-        """Fixed, or tied to another; empty for a free one."""
+    def freedom(self) -> str:
+        """ "fixed", or "tied to NAME"; an empty string for a free parameter."""
         return f"tied to {self.tie}" if self.tie is not None else "" if self.free else "fixed"
 
     def at(self, value: float, prior: tuple[float, float] | None = None) -> Parameter:
-        """A declared parameter at a value; `prior` replaces the declared one."""
+        """This declaration with the value `value`; `prior` (mean, standard deviation) replaces the declared prior."""
         if prior is None and self.prior is not None:
             prior = value + self.prior[0], self.prior[1]
         scale = prior[1] if prior is not None else self.scale or max(abs(value), 1e-3)
@@ -142,7 +148,11 @@ def row(unit: str, about: str) -> Any:
 
 
 def as_number(value: Any) -> Any:
-    """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
+    """A value as a float64 array; None stays None.
+
+    The type is explicit: numbers of Python are weakly typed, and beside arrays they would be compiled as programs of
+    their own.
+    """
     if value is None or (isinstance(value, jax.Array) and value.dtype == float and not value.weak_type):
         return value
     if isinstance(value, bool | int | float | np.ndarray | np.generic):
@@ -152,7 +162,7 @@ def as_number(value: Any) -> Any:
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> ValueError:
-    """The error for an unknown name, with the nearest valid ones."""
+    """The ValueError for an unknown name, which lists the nearest valid names."""
     return ValueError(f"there is no {what} {name!r}; {nearest(name, known)}")
 
 
@@ -177,7 +187,9 @@ class Component(eqx.Module):
         return (field,)
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """Its parameters, by field: those of the class and those `declared` for the instrument."""
+        """The parameters of this component, by field: those that its class declares and those that the description
+        `declared`.
+        """
         return {**field_declarations(type(self)), **dict(getattr(self, "declared", ()))}
 
 
@@ -188,7 +200,7 @@ Holder = tuple[str, ...]
 def _arrays(
     component: Component, part: str = "", path: Holder = ()
 ) -> Iterator[tuple[Holder, tuple[Parameter, ...]]]:
-    """The parameters of every array of a tree, in the order of its flattening."""
+    """The parameters of every array of a tree, in the order in which the tree is flattened."""
     declared = component.declarations()
     for field in dataclasses.fields(component):
         if field.metadata.get("static", False):
@@ -211,7 +223,7 @@ def _arrays(
 def _named(
     component: Component, name: str, declared: Parameter, value: Any, part: str
 ) -> tuple[Parameter, ...]:
-    """The parameters of one array."""
+    """The parameters of one array: one for a number, one for each element of a row."""
     labels = component.labels(name)
     if len(labels) != np.size(value):
         raise ValueError(f"{type(component).__name__}.{name}: {len(labels)} labels, {np.size(value)} values")
@@ -243,7 +255,11 @@ def is_row(kind: type[Component], number: str) -> bool:
 
 
 def by_shapes(function: Callable[..., Result]) -> Callable[..., Result]:
-    """The function of trees, called with shapes for their arrays, once for all trees of equal structure and shapes."""
+    """Decorator for a function whose result depends only on the structure of its trees and the shapes of their arrays.
+
+    The function is called with `jax.ShapeDtypeStruct` in the place of arrays, once for each structure; its result is
+    kept.
+    """
 
     @functools.lru_cache(maxsize=1024)
     def of_shapes(structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Result:
@@ -269,8 +285,8 @@ def parameter_places(component: Component) -> tuple[tuple[int, int], ...]:
     return tuple((position[holder], len(array)) for holder, array in _arrays(component) if array)
 
 
-def values_of(component: Component) -> Vector:
-    """The parameters of a component as one vector."""
+def values_of(component: Component) -> ParameterVector:
+    """The parameters of a component as one vector (n), in the order of `leaves`, each in its unit."""
     arrays = jax.tree_util.tree_leaves(component)
     chosen = [arrays[i] for i, _ in parameter_places(component)]
     tracer: Any = jax.core.Tracer  # pyright: ignore[reportAttributeAccessIssue]
@@ -280,17 +296,17 @@ def values_of(component: Component) -> Vector:
     return jnp.concatenate([jnp.ravel(array) for array in chosen])
 
 
-def with_values(component: AnyComponent) -> Callable[[Vector | np.ndarray], AnyComponent]:
-    """The function that replaces the parameters of a component by a vector.
+def with_values(component: AnyComponent) -> Callable[[ParameterVector | np.ndarray], AnyComponent]:
+    """A function that takes a vector (n) of parameters and returns the component with these in their places.
 
-    A vector of numpy is cut by numpy, without a program.
+    A vector of numpy is cut by numpy, without a compiled program.
     """
     arrays, structure = jax.tree_util.tree_flatten(component)
     places = [i for i, _ in parameter_places(component)]
     shapes = [np.shape(arrays[i]) for i in places]
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
 
-    def replaced(values: Vector | np.ndarray) -> AnyComponent:
+    def replaced(values: ParameterVector | np.ndarray) -> AnyComponent:
         filled, split = list(arrays), np.split if isinstance(values, np.ndarray) else jnp.split
         for i, segment, shape in zip(places, split(values, ends), shapes, strict=True) if places else ():
             filled[i] = array(segment.reshape(shape))

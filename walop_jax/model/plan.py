@@ -16,21 +16,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from walop_jax.model.compiled import array
-from walop_jax.model.fold import State
+from walop_jax.model.fold import ElementPositions
 from walop_jax.model.light_path import LightPath
 from walop_jax.model.ray import SMOOTH, Conditions
 from walop_jax.model.sources import ExposureArrays
 
 
 class Plan(eqx.Module):
-    """Static layout of a computation.
+    """What a computation is laid out for: wavelength nodes, bands, and settings of the moving elements.
 
-    Nodes: `wavelength` (µm) and the `conditions` at which the optics are solved. Bands: rows of `node_weight`, sorted
-    by positions of the moving elements; `moving` holds the prefixes of their columns and `settings` (positions, first
-    band, one past the last), a position being an angle in degrees, `Turning`, or None when out. `band_of[e, s + 1]` is
-    the band of exposure e for light of source s (s = −1: no source). Bands in which `slope` is 1 are weighted with the
-    distance from their mean wavelength (µm); None: there are none. `work` counts places × exposures of a computation:
-    programs for few of them are compiled without optimisation (`compiled`).
+    Nodes are the `wavelength` (µm) and `conditions` at which the optics are solved. Bands are rows of `node_weight`,
+    the weights of the nodes, sorted by the positions of the moving elements. `moving` holds the prefixes of the columns
+    of these, `settings` (positions, first band, one past the last band); a position is an angle in degrees, `Turning`,
+    or None for an element out of the beam. `band_of[e, s + 1]` is the band of exposure e for light of source s (s = −1:
+    no source). Bands in which `slope` is 1 are weighted with the distance from their mean wavelength (µm); None: there
+    are none. `work` counts places × exposures of a computation: programs for few of them are compiled without
+    optimisation (`compiled`).
+
+    Eight exposures through one filter with the calibration plate at 0° and 45° have two settings and two bands.
     """
 
     wavelength: Float[Array, " n"]
@@ -39,14 +42,14 @@ class Plan(eqx.Module):
     teff: Float[Array, " b"]
     exposures: ExposureArrays
     band_of: Int[np.ndarray, "e s"] = eqx.field(static=False)
-    settings: tuple[tuple[State, int, int], ...] = eqx.field(static=True)
+    settings: tuple[tuple[ElementPositions, int, int], ...] = eqx.field(static=True)
     moving: tuple[str, ...] = eqx.field(static=True)
     work: int = 0
     slope: Float[Array, " b"] | None = None
 
     @property
-    def states(self) -> list[State]:
-        """Positions of the moving elements, setting by setting."""
+    def positions(self) -> list[ElementPositions]:
+        """Positions of the moving elements, one tuple for each setting."""
         return [state for state, _, _ in self.settings]
 
 

@@ -23,7 +23,15 @@ from walop_jax.model.fold import Turning
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.materials import CRYSTALS, EXTRAPOLATED, MATERIALS
 from walop_jax.model.plan import Plan, blank_exposures
-from walop_jax.model.quadrature import FAINT, WAVES, Rule, band_rule, moments, rounded_up, waves_over
+from walop_jax.model.quadrature import (
+    FAINT,
+    WAVES,
+    QuadratureRule,
+    band_rule,
+    moments,
+    rounded_up,
+    waves_over,
+)
 from walop_jax.model.ray import CONDITIONS, SMOOTH, Conditions, within
 from walop_jax.model.sources import ExposureArrays
 
@@ -37,7 +45,7 @@ ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the 
 
 
 def hours_of(exposures: Exposures) -> Float[np.ndarray, " e"]:
-    """Time since the first exposure (h), 0 where MJD is missing."""
+    """Time (h) of every exposure since the first one; 0 where MJD is missing."""
     start = np.nanmin(exposures.mjd) if len(exposures) and np.isfinite(exposures.mjd).any() else 0.0
     return np.nan_to_num((exposures.mjd - start) * 24.0)
 
@@ -78,7 +86,7 @@ def plan_for(
     filters: Mapping[str, FilterCurve],
     sources: Sources | None = None,
 ) -> Plan:
-    """Lay out the nodes and bands of `exposures`, in the detail required by the instrument.
+    """The plan for `exposures`: nodes and bands in the detail that the instrument requires.
 
     Standards with a colour have the slopes of the bands as well. Raises KeyError for a filter missing from `filters`
     and ValueError for a KIND without a source.
@@ -93,7 +101,7 @@ def plan_for(
         colour = np.tile(sources.teff, of_stars.sum())
         teff[starlight] = np.where(np.isfinite(colour), colour, teff[starlight])
     sloping = np.flatnonzero(of_stars) if instrument.standard.bands else indices[:0]
-    # For slopes, of second order, a typical star will do.
+    # The slope term is of second order, so one median temperature serves all stars.
     temperatures = np.zeros(0) if sources is None else sources.teff[np.isfinite(sources.teff)]
     typical = float(np.median(temperatures)) if temperatures.size else np.nan
     row, teff = np.append(row, sloping), np.append(teff, np.full(len(sloping), typical))
@@ -103,7 +111,8 @@ def plan_for(
         table = np.empty((len(indices), 1 + stars), int)
         table[~of_stars] = band[~starlight, None]
         table[of_stars, 1:] = band[starlight].reshape(of_stars.sum(), stars)
-        table[of_stars, 0] = table[of_stars, -1]  # a standard without its star is not used
+        # A standard's row for "no star" is never used: any band will do.
+        table[of_stars, 0] = table[of_stars, -1]
         return table
 
     unit_flux = [source.kind for source in instrument.sources if source.facts.flux_known]
@@ -142,10 +151,11 @@ def colours(
 def _sharing(
     exposures: ExposureArrays, settings: Settings, steady: Bool[np.ndarray, " e"], *, split: bool
 ) -> ExposureArrays:
-    """Exposures with a common flux: steady light in each filter, and, `split`, light of known flux.
+    """The exposures with their flux groups: steady light has one flux in each filter; with `split` so has light of
+    known flux.
 
-    The shares of such light in the arms are unknown, and equal in all exposures of a filter with the same positions of
-    all elements.
+    The fractions of such light that go into the arms are unknown, and equal in all exposures of a filter with the same
+    positions of all elements.
     """
     flux_known = np.asarray(exposures.flux_known)
     group = np.arange(len(flux_known))
@@ -178,7 +188,7 @@ def plan_for_settings(instrument: Instrument, settings: Settings, filters: Mappi
 
 
 @functools.lru_cache(maxsize=256)
-def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> Rule:
+def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes: float) -> QuadratureRule:
     """Nodes of a band and their weights; cached, since the models of one set mostly share them."""
     path_difference, waves, faint = fringes
     return band_rule(
@@ -221,9 +231,10 @@ def extrapolations(instrument: Instrument, curves: Iterable[FilterCurve]) -> tup
 
 
 def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> tuple[float, float]:
-    """Waves of the fringes of an instrument (patched) in a band: at full strength, and of all layers of a plate.
+    """Waves of the fringes of an instrument (patched) in a band: those of full strength, and those of all layers of a
+    plate.
 
-    Retarders in series interfere at the sum of their retardances. Nodes are made for `room` times as many.
+    Retarders in series interfere at the sum of their retardances. Nodes are made for `room` times as many waves.
     """
     wavelengths = curve.wavelength[curve.throughput > 0]
     at = np.linspace(wavelengths.min(), wavelengths.max(), SAMPLES) if wavelengths.size else curve.wavelength
@@ -263,8 +274,8 @@ def _plan(
             _, start, _, stop = name.split()
             values[name] = within(values["hours"], start, stop) * 1.0
     # A band is (positions, filter, conditions, smooth ones, colour temperature, slope, KIND); sorting puts equal
-    # positions together. NaN (out, flat spectrum) becomes a sortable stand-in. KINDs of one colour are separate, so
-    # that a set with another colour for one of them has a plan of the same shape, and the same programs.
+    # positions together. NaN (out, flat spectrum) becomes a number that can be sorted. KINDs of one colour are
+    # separate, so that a set with another colour for one of them has a plan of the same shape, and the same programs.
     # The angles of all elements, then their turns during the exposure.
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
     turns = [settings.turns.get(prefix, np.zeros(count)) for prefix in moving]
@@ -278,7 +289,7 @@ def _plan(
 
     curves = {name: filters[name] for name in sorted({name for _, name, *_ in bands})}
     extrapolations(patched, curves.values())
-    # Phases that grow with hours or the hour angle are small.
+    # Only temperature changes a plate's phase enough to need extra nodes; growth with hours or the hour angle is small.
     slopes = {"temperature": _phase_per_kelvin(patched, curves.values())} if smooth else {}
     swings = (0.5 * float(np.ptp(values[name])) * slopes.get(name, 0.0) for name in smooth)
     groups, share = _points([band[1:4] for band in bands], [*map(nodes_for, swings)])
@@ -336,28 +347,30 @@ Moment = tuple[float, ...]
 def _points(
     bands: Sequence[tuple[str, Moment, Moment]], most: Sequence[int]
 ) -> tuple[list[tuple[str, Moment, Moment]], Float[np.ndarray, "b g"]]:
-    """Points at which the optics are solved, and the share of each in each band.
+    """Points at which the optics are solved, and the weight of each in each band.
 
-    Both are a filter, conditions that are followed one by one, and smooth ones with `most` nodes.
+    A point is a filter with values of the conditions; conditions are either followed one by one or, if smooth,
+    interpolated between `most` nodes.
     """
     together: dict[tuple[str, Moment], set[Moment]] = {}
     for name, at, followed in bands:
         together.setdefault((name, at), set()).add(followed)
-    shares = {case: shares_of_points(moments, most) for case, moments in sorted(together.items())}
-    points = [(*case, at) for case, of in shares.items() for at in sorted(set().union(*of.values()))]
+    weights = {case: weights_of_points(moments, most) for case, moments in sorted(together.items())}
+    points = [(*case, at) for case, of in weights.items() for at in sorted(set().union(*of.values()))]
     number = {point: i for i, point in enumerate(points)}
     share = np.zeros((len(bands), len(points)))
     for row, (name, at, followed) in zip(share, bands, strict=True):
-        for point, part in shares[name, at][followed].items():
+        for point, part in weights[name, at][followed].items():
             row[number[name, at, point]] = part
     return points, share
 
 
-def shares_of_points(moments: Collection[Moment], most: Sequence[int]) -> dict[Moment, dict[Moment, float]]:
-    """Points at which the optics are solved for some moments, and the share of each point in each moment.
+def weights_of_points(moments: Collection[Moment], most: Sequence[int]) -> dict[Moment, dict[Moment, float]]:
+    """Points at which the optics are solved for some moments (values of conditions), and their weights in each moment.
 
-    Lagrange's interpolation on a grid with at most so many nodes along each condition; the moments themselves where a
-    grid has no fewer points. Source: Trefethen 2013, Approximation Theory, chs. 5, 8.
+    The weights are those of Lagrange's interpolation on a grid with at most `most` nodes along each condition; the
+    moments themselves are the points where a grid would have no fewer. Source: Trefethen 2013, Approximation Theory,
+    chs. 5, 8.
     """
     at = np.array(sorted(moments))
     every = [_along(values, count) for values, count in zip(at.T, most, strict=True)]
@@ -374,7 +387,9 @@ def shares_of_points(moments: Collection[Moment], most: Sequence[int]) -> dict[M
 def _along(
     values: Float[np.ndarray, " n"], most: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
-    """Nodes along a condition and their Lagrange polynomials at its values: these themselves, if there are few."""
+    """Nodes along one condition, and the values of their Lagrange polynomials at `values`; few values are the nodes
+    themselves.
+    """
     points, place = np.unique(values, return_inverse=True)
     if len(points) <= most:
         return points, np.eye(len(points))[place]

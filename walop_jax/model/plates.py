@@ -35,9 +35,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from walop_jax.model.mueller import Matrix2, computed_once, from_jones, inverse2, matrix2, product2, retarder
-
-Real = Float[Array, "..."]
+from walop_jax.model.mueller import (
+    Matrix2,
+    Real,
+    computed_once,
+    from_jones,
+    inverse2,
+    matrix2,
+    product2,
+    retarder,
+)
 
 
 class Plate(NamedTuple):
@@ -100,18 +107,18 @@ def _crystal(sx: Real, sy: Real, plate: Plate) -> _Waves:
 
 
 def _with_air(air: Matrix2, crystals: Matrix2) -> Matrix2:
-    """The fields ahead of every face, media along the third axis: air, then the crystals."""
+    """The fields ahead of every interface, along the third axis: those of air, then those of the crystals."""
     ahead, inside = jnp.broadcast_arrays(air[:, :, None], crystals)
     return computed_once(jnp.concatenate([ahead[:, :, :1], inside], axis=2))
 
 
 def _behind(ahead: Matrix2) -> Matrix2:
-    """The fields behind every face: of the next medium, in the end of air."""
+    """The fields behind every interface: those of the next medium, and of air behind the last."""
     return jnp.roll(ahead, -1, axis=2)
 
 
 def _faces(air: _Waves, crystals: _Waves) -> Matrix2:
-    """Transmission of amplitudes through every face of the stack."""
+    """Matrices (2, 2, …) of the transmitted amplitudes, one for every interface of the stack."""
     electric, magnetic = (_with_air(*pair) for pair in zip(air[:2], crystals[:2], strict=True))
     passed = product2(inverse2(electric), _behind(electric))
     return 2.0 * inverse2(passed + product2(inverse2(magnetic), _behind(magnetic)))
@@ -152,7 +159,10 @@ def _crystal_both_ways(sx: Real, sy: Real, plate: Plate) -> tuple[_Waves, _Waves
 
 
 def _faces_both_ways(air: _Waves, forward: _Waves, backward: _Waves) -> Matrix2:
-    """As `_faces`; the backward waves of air have the same tangential E and the opposite tangential H."""
+    """The same as `_faces`, with backward waves that are no mirror images of the forward ones.
+
+    In air the backward waves have the same tangential E and the opposite tangential H.
+    """
     electric, magnetic = (_with_air(*pair) for pair in zip(air[:2], forward[:2], strict=True))
     back = _with_air(air.electric, backward.electric), _with_air(-air.magnetic, backward.magnetic)
     y = -product2(back[1], inverse2(back[0]))
@@ -187,7 +197,7 @@ def stack_jones(sx: Real, sy: Real, plates: tuple[Plate, ...], wavelength: Real)
 
 
 def alike(stacks: Sequence[tuple[Plate, ...]]) -> list[tuple[Plate, ...]]:
-    """Stacks whose plates all have a cut, or none: the same arrays in every plate."""
+    """The stacks with a `cut` in every plate if any plate has one, so that all plates have the same arrays."""
     if all(plate.cut is None for stack in stacks for plate in stack):
         return list(stacks)
     return [

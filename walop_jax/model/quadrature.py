@@ -21,6 +21,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from walop_jax.io.shapes import Vector
+
 SOURCE = "Golub & Welsch 1969, Math. Comp. 23, 221; Gautschi 2004, Orthogonal Polynomials, 2.2.3"
 FINEST = 0.0005  # µm
 WAVES = 36.0  # of one plate at 0.62 µm: (n_e − n_o) d / λ
@@ -32,11 +34,10 @@ STEP = 1.05  # ratio of the numbers of waves of rules: plates of nearly equal th
 PER_WAVE = 8.0  # pieces of a straight line for each turn of the fastest fringe, at least
 MAXIMUM_NODES = 600
 
-Vector = Float[np.ndarray, " n"]
-Rule = tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]
+QuadratureRule = tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]
 
 
-def tabulated_measure(wavelength: Vector, throughput: Vector, waves: float = WAVES) -> Rule:
+def tabulated_measure(wavelength: Vector, throughput: Vector, waves: float = WAVES) -> QuadratureRule:
     """Nodes and weights of a measure over a tabulated curve, on pieces of 0.5 nm; weights sum to 1.
 
     Up to `WAVES` the trapezium rule, beyond them straight lines between the rows.
@@ -102,7 +103,7 @@ def _recurrence(node: Vector, weight: Vector) -> Iterator[tuple[float, float]]:
         vector = step / beta
 
 
-def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
+def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[QuadratureRule]:
     """Gauss rules of growing numbers of nodes, fewer than the measure has; its weights sum to 1."""
     centre, half = 0.5 * (node[0] + node[-1]), 0.5 * (node[-1] - node[0])
     rows = _recurrence((node - centre) / half, weight)
@@ -114,7 +115,7 @@ def gauss_rules(node: Vector, weight: Vector, counts: range) -> Iterator[Rule]:
         yield centre + half * value, columns[0] ** 2
 
 
-def _fringe_error(rule: Rule, measure: tuple[Vector, Vector], waves: float) -> float:
+def _fringe_error(rule: QuadratureRule, measure: tuple[Vector, Vector], waves: float) -> float:
     # Phase of a plate of fixed birefringence, 2π waves · 0.62/λ, at a range of thicknesses.
     thickness = 2j * np.pi * 0.62 * waves * np.linspace(0.3, 1.0, 8)[:, None]
     mean, exact = (np.exp(thickness / node) @ weight for node, weight in (rule, measure))
@@ -128,7 +129,7 @@ def band_rule(
     path_difference: float = 0.0,
     waves: float = WAVES,
     faint: float = FAINT,
-) -> Rule:
+) -> QuadratureRule:
     """Fewest wavelength nodes (µm) and weights (sum 1) that integrate plate fringes to `tolerance`.
 
     `waves` are those of the fringes of full strength (`waves_over`). Fringes at twice the frequency of usual plates

@@ -11,25 +11,30 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-Real = Float[Array, "..."]
+from walop_jax.model.mueller import Real
 
 CONDITIONS = {"temperature": "TEMP", "hour_angle": "HA", "hours": "MJD", "exptime": "EXPTIME"}
-"""Conditions on which the optics may depend from exposure to exposure (Celsius; hours; hours since the first one; s),
-and their columns of EXPOSURES. Whether an exposure is of some KIND is one more, for each KIND, as is whether it is of
-some interval of hours."""
+"""Conditions on which the optics may depend from exposure to exposure, and their columns of EXPOSURES: temperature in
+Celsius, hour angle in hours, hours since the first exposure, exposure time in seconds. Two more kinds of condition are
+flags, 0 or 1: "this exposure has KIND k", and "this exposure was taken in this interval of hours"."""
 SMOOTH = "smooth "
-"""Opens the name of a condition of which the optics are needed at a few values only (`planning.SMOOTH_NODES`)."""
+"""Opens the name of a condition on which the optics depend smoothly, such as "smooth temperature": they are computed at
+a few values of it and interpolated between them (`planning.SMOOTH_NODES`)."""
 
 
 def within(hours: Any, start: str, stop: str) -> Any:
-    """True for hours of an interval, which is given as it is typed; the end is outside."""
+    """True for times that lie in the interval from `start` to `stop` (hours, as typed: "1.5"); `stop` itself lies
+    outside.
+    """
     return (hours >= float(start)) & (hours < float(stop))
 
 
 class NotPlannedError(ValueError):
-    """The optics depend on a quantity that the plan lacks: `quantity`, `asked` for as a smooth one or not."""
+    """The optics depend on a quantity for which the plan has no values.
+
+    `quantity` is its name, with `SMOOTH` ahead of it if it was asked for as a smooth one.
+    """
 
     def __init__(self, quantity: str) -> None:
         self.asked, self.quantity = quantity, quantity.removeprefix(SMOOTH)
@@ -40,9 +45,9 @@ class NotPlannedError(ValueError):
 
 
 class Conditions(eqx.Module):
-    """Conditions of an exposure at every wavelength node: those that the optics use.
+    """Values of the conditions (temperature, hour angle …) at every wavelength node: those that the optics use.
 
-    `band_width` is the equivalent width (µm) of the filter of a node.
+    `band_width` is the equivalent width (µm) of the filter of a node. An element reads `ray.conditions.temperature`.
     """
 
     band_width: Real
@@ -54,11 +59,15 @@ class Conditions(eqx.Module):
         return self._planned(name)
 
     def smooth(self, name: str) -> Real:
-        """One of `CONDITIONS` on which the optics depend as a polynomial does, to all digits that count."""
+        """The values of a condition on which the optics depend like a low polynomial, so that a few values serve.
+
+        The interpolation between them is exact to all digits that count. Raises `NotPlannedError` if the plan has no
+        values.
+        """
         return self.planned[name] if name in self.planned else self._planned(SMOOTH + name)
 
     def holds(self, name: str) -> bool:
-        """True if one of `CONDITIONS` is there, at its values or at a few."""
+        """True if the plan has values of a condition, one for each exposure or a few for interpolation."""
         return name in self.planned or SMOOTH + name in self.planned
 
     def between(self, start: str, stop: str) -> Real:
@@ -76,7 +85,11 @@ class Conditions(eqx.Module):
 
 
 class Ray(eqx.Module):
-    """A ray at a place of the train; its direction is (kx, ky, kz), in air."""
+    """A ray at one element of the train: its field point (`x`, `y`, deg) and its direction (kx, ky, kz) in air.
+
+    `spectrum` holds the wavelengths (µm) of the nodes and the `Conditions` at them; None for elements that are
+    evaluated without a wavelength.
+    """
 
     x: Real
     y: Real
@@ -86,13 +99,18 @@ class Ray(eqx.Module):
 
     @classmethod
     def entering(cls, x: Real, y: Real, spectrum: tuple[Real, Conditions] | None = None) -> Ray:
-        """The ray from a field point (deg) ahead of the mapping from field to pupil: along the axis."""
+        """The ray of a field point (deg) as it enters the train: along the axis, for the field tilts it only in the
+        pupil mapping.
+        """
         zero = jnp.zeros(())
         return cls(x, y, zero, zero, spectrum)
 
     @classmethod
     def on_trial(cls, quantities: Iterable[str]) -> Ray:
-        """A ray along the axis at one wavelength, with some of `CONDITIONS`: for dependences."""
+        """A test ray along the axis at one wavelength that carries the given conditions.
+
+        An element is run with it to find out which conditions it asks for (`dependence`).
+        """
         ones, zero = jnp.ones(1), jnp.zeros(())
         return cls.entering(
             zero, zero, (0.62 * ones, Conditions(0.1 * ones, dict.fromkeys(quantities, ones)))
@@ -112,15 +130,15 @@ class Ray(eqx.Module):
 
     @property
     def conditions(self) -> Conditions:
-        """Conditions of the exposure."""
+        """The conditions at the wavelength nodes. Raises `NotPlannedError` for a ray without a wavelength."""
         if self.spectrum is None:
             raise NotPlannedError("conditions")
         return self.spectrum[1]
 
     def moved(self, x: Real, y: Real) -> Ray:
-        """The ray from another field point."""
+        """The same ray from the field point `x`, `y` (deg)."""
         return Ray(x, y, self.kx, self.ky, self.spectrum)
 
     def toward(self, kx: Real, ky: Real) -> Ray:
-        """The ray in another direction."""
+        """The same ray in the direction with the cosines `kx`, `ky`."""
         return Ray(self.x, self.y, kx, ky, self.spectrum)

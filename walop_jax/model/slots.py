@@ -1,8 +1,8 @@
 """Slots: places of possible changes of the light path, and the derivatives of the light in these changes.
 
 A slot is a change without factors (`effects.change`), or a term of one; the kind of a change holds its slots
-(`Kind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots. Elements,
-fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
+(`ChangeKind.slots`). The factors of a change, over the field or from exposure to exposure, multiply its slots.
+Elements, fold, band integral and patches are those of the forward model, differentiated at the unchanged instrument.
 
     inserted    generators (`optics.GENERATORS`) at every place between two elements, by themselves and × (λ/λ₀ − 1)
     number      axis and thermal change of every wave plate; thickness, axis and cut of each of its layers
@@ -44,11 +44,11 @@ from walop_jax.model.materials import REFERENCE_TEMPERATURE
 from walop_jax.model.parameters import by_shapes
 from walop_jax.model.plan import Plan
 from walop_jax.model.ray import Conditions, NotPlannedError, Ray
-from walop_jax.model.sources import MoonPatches, MoonSky, Sight, Standards
+from walop_jax.model.sources import MoonPatches, MoonSky, PointIllumination, Standards
 
 Slot = tuple[Any, ...]
 Moved = Callable[[Float[Array, " t"]], Instrument]
-Place = tuple[Scalar, Scalar]  # in the field (deg)
+FieldPoint = tuple[Scalar, Scalar]  # in the field (deg)
 Gaps = Float[Array, " g"]  # thicknesses of air (µm)
 OF_PLATE, OF_LAYER = ("axis", "thermal"), ("thickness", "axis", "cut")
 
@@ -214,16 +214,16 @@ def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[
 
 
 def _vectors(
-    instrument: Instrument, at: Place, rows: Array, mean: Array, throughput: Array, shares: Array
+    instrument: Instrument, at: FieldPoint, rows: Array, mean: Array, throughput: Array, shares: Array
 ) -> light.Vectors:
-    """Analysis vectors with shares of every camera in every other."""
+    """Analysis vectors with fractions of every camera in every other."""
     beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
     pairs = tuple(np.ndindex(len(throughput), len(throughput)))
     vectors = light.behind_throughput(instrument, beams, throughput, *at)
     return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
 
 
-def _banded(plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:
+def _banded(plan: Plan, at: FieldPoint, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:
     """Band sums at a field point, and slopes in the sizes of `moved`: of single plates, then of all together.
 
     Those of plates are multiplied by fringes of air of some thicknesses (µm).
@@ -234,7 +234,7 @@ def _banded(plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: G
 
 
 def _summed(
-    plan: Plan, at: Place, moved: Moved, sizes: tuple[int, int], gaps: Gaps, stretch: Scalar
+    plan: Plan, at: FieldPoint, moved: Moved, sizes: tuple[int, int], gaps: Gaps, stretch: Scalar
 ) -> _Banded:
     """The same at wavelengths times a factor, without the differences between beams."""
     conditions = plan.conditions
@@ -244,7 +244,7 @@ def _summed(
 
     def path_of(instrument: Instrument) -> fold.Fold:
         ray = Ray.entering(*at, (stretch * light.node_wavelengths(instrument, plan), conditions))
-        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
+        return fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.positions)
 
     def solved(sizes: Float[Array, " t"]) -> tuple[fold.Solved, Float[Array, "b n"]]:
         changed = moved(sizes)
@@ -339,14 +339,14 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     return {("light", *slot): i for i, slot in enumerate(slots)}
 
 
-def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
+def light_slopes(instrument: Instrument, illumination: PointIllumination) -> LightSlopes:
     """Slopes of the light at a field point."""
     instrument = instrument.patched()
-    exposures, x, y, slots = sight.exposures, sight.x, sight.y, light_slots(instrument)
+    exposures, x, y, slots = illumination.exposures, illumination.x, illumination.y, light_slots(instrument)
     count = exposures.kind.shape[0]
 
     def stokes(sizes: Float[Array, " l"]) -> Float[Array, "e 4"]:
-        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), sight)
+        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), illumination)
 
     value, slopes = derivatives(stokes, (jnp.zeros(len(slots)),), (jnp.eye(len(slots)),))
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))

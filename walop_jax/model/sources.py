@@ -38,14 +38,15 @@ SHORTEST = 0.2  # µm: no λmax below
 
 
 class ExposureArrays(eqx.Module):
-    """Exposures in the arrays of the light path, one element each; `median` only where needed.
+    """Exposures as arrays of the light path, one element for each exposure (e).
 
-    `kind` counts the kinds of `kinds`. Angles in radians; `clp_angle` is 0 when the polariser is out, `rotator` where
-    it has no meaning; `shared` is 1 for an exposure of a group with common fluxes, None: no such groups. `moving` holds
-    angles of elements that move behind the polariser (NaN: out). `hours` since the first exposure, temperature in
-    Celsius, hour angle in h, exposure time in s. Where standards have a colour, `colour` holds mean wavelength and rms
-    width (µm) of the photons of each of them behind the filter, `slope_band` the band that is weighted with the
-    distance from its mean wavelength (`Plan.slope`).
+    `kind` is the position of the KIND in `kinds`. Angles are in radians: `clp_angle` is 0 when the polariser is out,
+    `rotator` is 0 where it has no meaning, and `moving` holds the angles of elements that move behind the polariser
+    (NaN: out). `hours` count from the first exposure; temperature is in Celsius, the hour angle in h, the exposure time
+    in s. `shared[e, s]` is 1 if exposure e belongs to flux group s; None if there are no such groups. `median_counts`
+    are there only where a detector needs them. Where standards have a colour, `colour[e, s]` holds mean wavelength and
+    rms width (µm) of the photons of standard s behind the filter of exposure e, and `slope_band` the band that is
+    weighted with the distance from its mean wavelength (`Plan.slope`).
     """
 
     kind: Int[Array, " e"]
@@ -66,12 +67,14 @@ class ExposureArrays(eqx.Module):
 
     @property
     def wavelength(self) -> Any:
-        """Mean wavelengths (µm) of the filters, for the first star; the reference wavelength without colours."""
+        """Mean wavelengths (µm, e) of the filters for the first star; the reference wavelength without colours."""
         return REFERENCE_WAVELENGTH if self.colour is None else self.colour[:, 0, 0]
 
     @property
     def median(self) -> Float[Array, "e k"]:
-        """Median counts over the field of every camera."""
+        """Median counts over the field in every exposure and camera (e, k). Raises `NotPlannedError` where they are
+        missing.
+        """
         if self.median_counts is None:
             raise NotPlannedError("median")
         return self.median_counts
@@ -85,11 +88,11 @@ class ExposureArrays(eqx.Module):
         return self.kind == (self.kinds.index(name) if name in self.kinds else -1)
 
 
-class Sight(NamedTuple):
-    """Target at one field point, exposure by exposure.
+class PointIllumination(NamedTuple):
+    """The light that one field point sees, exposure by exposure.
 
-    `sky` is (q, u) in the instrument frame of singly scattered moonlight for δ = 1, `source` the row of the
-    standard star or −1; field coordinates in degrees.
+    `sky` is (q, u) of singly scattered moonlight in the instrument frame, before depolarisation (δ = 1); `source` is
+    the row of the standard star in SOURCES, −1 without one; `x`, `y` are field coordinates in degrees.
     """
 
     exposures: ExposureArrays
@@ -102,8 +105,8 @@ class Sight(NamedTuple):
 class Source(Component):
     """Light of one KIND of exposures: its polarisation ahead of the instrument, per unit of flux.
 
-    `kind` is the KIND in EXPOSURES, `facts` are the properties of all its exposures; `reference` is the source of its
-    assumptions.
+    `kind` is the KIND in EXPOSURES, `facts` are the properties that all its exposures have, `reference` says where its
+    assumptions are from. `MoonSky` is the source of the KIND `moon`.
     """
 
     name: ClassVar[str] = ""
@@ -111,13 +114,13 @@ class Source(Component):
     facts: ClassVar[ExposureKind] = ExposureKind()
     reference: ClassVar[str] = ""
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """True for its exposures."""
-        return jnp.asarray(sight.exposures.of_kind(self.kind))
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
+        """True (e) in the exposures of this source."""
+        return jnp.asarray(illumination.exposures.of_kind(self.kind))
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """(q, u) in the instrument frame; unpolarised by default."""
-        return jnp.zeros((sight.exposures.kind.shape[0], 2))
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
+        """(q, u) of the light in the instrument frame (e, 2); unpolarised unless a source says otherwise."""
+        return jnp.zeros((illumination.exposures.kind.shape[0], 2))
 
 
 def turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "e 2"]:
@@ -127,20 +130,22 @@ def turned(qu: Float[Array, "e 2"], angle: Float[Array, " e"]) -> Float[Array, "
 
 
 class MoonPatches(Component):
-    """Polarisation of single Moon exposures, at some positions of the list, beyond single scattering."""
+    """Polarisation of single Moon exposures beyond single scattering: q, u (m) added at `positions` in the list of
+    exposures.
+    """
 
     q: Float[Array, " m"]
     u: Float[Array, " m"]
     positions: tuple[int, ...] = eqx.field(static=True, default=())
 
     def joined(self, other: MoonPatches) -> MoonPatches:
-        """The union of both; common patches add up."""
+        """The patches of both; where both have an exposure their q, u add up."""
         q, u = jnp.concatenate([self.q, other.q]), jnp.concatenate([self.u, other.u])
         return MoonPatches(q, u, (*self.positions, *other.positions))
 
 
 class MoonSky(Source):
-    """Singly scattered moonlight, depolarised."""
+    """The moonlit sky: singly scattered moonlight, depolarised."""
 
     depolarisation: Scalar = param(
         "", "δ, one for all patches and wavelengths", f"{PAPER_II}, eq. 8", scale=0.05, default=0.8
@@ -152,13 +157,13 @@ class MoonSky(Source):
     kind: ClassVar[str] = "moon"
     reference: ClassVar[str] = f"{PAPER_II}, eq. 8"
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """Moon exposures without the polariser."""
-        return super().shines(sight) & ~sight.exposures.clp_in
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
+        """True (e) in Moon exposures without the polariser."""
+        return super().shines(illumination) & ~illumination.exposures.clp_in
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """Polarisation of the patch."""
-        sky = sight.sky
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
+        """(q, u) of the patch of sky at the field point (e, 2), in the instrument frame."""
+        sky = illumination.sky
         qu = self.depolarisation * sky
         if self.missing is not None:
             power = jnp.sum(sky**2, axis=-1, keepdims=True)
@@ -170,12 +175,13 @@ class MoonSky(Source):
 
 
 class Standards(Source):
-    """Catalogue Stokes parameters of the standard stars.
+    """Catalogue Stokes parameters of the standard stars, in the equatorial frame.
 
-    There is a value for each of `names`; `stars` holds for each the first value of its star, `bands` mean wavelength
-    and rms width (µm) of its band. Both are empty without colours: then a value holds for any light. `unknown` are
-    values of an unknown band among those in which the star was observed.
-    `changes` are added to the values in single exposures.
+    A *value* is one (q, u) of a star in a band; there is one for each of `names`. `stars` holds for each value the
+    number of the first value of its star, `bands` mean wavelength and rms width (µm) of its band; both are empty
+    without colours, and a value then holds for any light. `unknown` are values whose band is unknown among those in
+    which the star was observed. `changes` are added to the values in single exposures. HD_14069 known in V and R has
+    two values, both with the same entry in `stars`.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -194,7 +200,9 @@ class Standards(Source):
     stars: tuple[int, ...] = eqx.field(static=True, default=())
     unknown: tuple[int, ...] = eqx.field(static=True, default=())
     angle: Scalar | None = number("deg", "added to all position angles", default=None)
-    share: Scalar | None = number("", "share by which all degrees of polarisation are larger", default=None)
+    share: Scalar | None = number(
+        "", "fraction by which all degrees of polarisation are larger", default=None
+    )
     changes: tuple[Any, ...] = ()  # `effects.numbers.GrownStandard`
 
     name: ClassVar[str] = "standard"
@@ -230,19 +238,21 @@ class Standards(Source):
         return tuple(self.names[i].partition(".")[0] for i in firsts)
 
     def labels(self, field: str) -> Sequence[str]:
-        """One name per value, or per star."""
+        """One name for each value (q, u), or for each star (lmax, turn)."""
         if field in ("lmax", "turn"):
             return tuple(f"{name}.{field}" for name in self.star_names) if self.bands else ()
         names = [self.names[i] for i in self.unknown] if field == "wavelength" else self.names
         return tuple(f"{name}.{field}" for name in names)
 
-    def shines(self, sight: Sight) -> Bool[Array, " e"]:
-        """True for exposures with a star as their source."""
-        has_star = sight.source >= 0
+    def shines(self, illumination: PointIllumination) -> Bool[Array, " e"]:
+        """True (e) in exposures of a star that is in the list."""
+        has_star = illumination.source >= 0
         return has_star if self.names else jnp.zeros_like(has_star)
 
     def values(self, source: Int[Any, "*p e"], colour: Float[Any, "e s 2"] | None) -> Int[Any, "*p e"]:
-        """The value of a source in each exposure: that of its star with the nearest band; −1 for none."""
+        """Number of the value used in each exposure: of the values of its star the one with the nearest band; −1 for
+        none.
+        """
         if colour is None or len(set(self.stars)) == len(self.names):
             return source
         observed = colour[jnp.arange(source.shape[-1]), source, 0]
@@ -252,24 +262,24 @@ class Standards(Source):
         )
         return jnp.where(source >= 0, nearest, -1)
 
-    def polarisation(self, sight: Sight) -> Float[Array, "e 2"]:
-        """Polarisation of the star of each exposure, the mean over the band."""
+    def polarisation(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
+        """(q, u) of the star of each exposure (e, 2) in the instrument frame, the mean over the band."""
         if not self.names:
-            return super().polarisation(sight)
-        return self._seen(sight)[0]
+            return super().polarisation(illumination)
+        return self._seen(illumination)[0]
 
-    def slope(self, sight: Sight) -> Float[Array, "e 2"]:
-        """Change of (q, u) with wavelength (per µm) at the mean wavelength of the band; 0 without a star."""
-        return jnp.where(sight.source[:, None] >= 0, self._seen(sight)[1], 0.0)
+    def slope(self, illumination: PointIllumination) -> Float[Array, "e 2"]:
+        """Change of (q, u) with wavelength (e, 2; per µm) at the mean wavelength of the band; 0 without a star."""
+        return jnp.where(illumination.source[:, None] >= 0, self._seen(illumination)[1], 0.0)
 
-    def _seen(self, sight: Sight) -> tuple[Float[Array, "e 2"], Float[Array, "e 2"]]:
+    def _seen(self, illumination: PointIllumination) -> tuple[Float[Array, "e 2"], Float[Array, "e 2"]]:
         """(q, u) in the instrument frame, and its slope."""
-        colour = sight.exposures.colour
-        row = jnp.maximum(self.values(sight.source, colour), 0)
-        qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), sight.exposures.rotator
+        colour = illumination.exposures.colour
+        row = jnp.maximum(self.values(illumination.source, colour), 0)
+        qu, rotator = jnp.stack([self.q[row], self.u[row]], axis=-1), illumination.exposures.rotator
         for change in self.changes:
             qu = qu.at[:, change.axis].add(
-                jnp.where(row == change.value, change.size * change.factor(sight.exposures), 0.0)
+                jnp.where(row == change.value, change.size * change.factor(illumination.exposures), 0.0)
             )
         if self.share is not None:
             qu = (1.0 + self.share) * qu

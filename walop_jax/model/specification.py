@@ -1,6 +1,7 @@
-"""The model as a list of parameters beside their instrument: free or tied ones, with priors.
+"""`Model`: the list of parameters of an instrument, each free, fixed or tied to another, with its prior.
 
-Three things of one shape: values, freedom and priors. Names come from the tree (`parameters.leaves`).
+A vector of values, the freedom of each parameter and the priors have one order, that of the tree; names come from the
+tree as well (`parameters.leaves`).
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.model.compiled import array
 from walop_jax.model.elements.wave_plate import Layer, WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, check_names, leaves, unknown_name, values_of, with_values
 
-Vector = Float[np.ndarray, " n"]
 THROUGHPUT = "throughput"
 """The part of an instrument that is a smooth map: single terms of it have no meaning."""
 GAUGE = "throughput.n0.p00"
@@ -64,7 +65,7 @@ class Model:
             "START": (self.start, "", "start value"),
             "PRIOR_MEAN": (priors[:, 0], "", "mean of the prior"),
             "PRIOR_SIGMA": (priors[:, 1], "", "standard deviation of the prior"),
-            "STATE": (np.array([p.state or "free" for p in self.parameters]), "", "free, fixed or tied"),
+            "STATE": (np.array([p.freedom or "free" for p in self.parameters]), "", "free, fixed or tied"),
             "ABOUT": (np.array([p.about for p in self.parameters]), "", "meaning"),
         }
 
@@ -86,7 +87,7 @@ class Model:
 
     @property
     def effect_names(self) -> tuple[str, ...]:
-        """Names of the active effects, in the order of the light path."""
+        """Names of the active effects, in the order in which they change the instrument."""
         return tuple(effect.name for effect in self.template.effects)
 
     def __getitem__(self, name: str) -> Parameter:
@@ -117,13 +118,15 @@ class Model:
 
     @property
     def masters(self) -> Int[np.ndarray, " n"]:
-        """For each parameter the position of its master: the parameter of its tie, else itself."""
+        """Position (n) of the master of each parameter: of the parameter that it is tied to, else its own."""
         place = {p.name: i for i, p in enumerate(self.parameters)}
         return np.array([place[p.tie or p.name] for p in self.parameters], int)
 
     @property
     def start(self) -> Vector:
-        """Start values of all parameters; a tied one starts where its master does."""
+        """Start values of all parameters (n), each in its unit; a tied parameter starts at the start value of its
+        master.
+        """
         return np.array([p.start for p in self.parameters], float)[self.masters]
 
     @property
@@ -132,13 +135,16 @@ class Model:
         return np.array([i for i, p in enumerate(self.parameters) if p.free and p.tie is None], int)
 
     def selection(self) -> Float[np.ndarray, "n f"]:
-        """Derivative of all parameters with respect to the free ones: ones, ties included."""
+        """Matrix (n, f) of ones and zeros: derivative of all parameters in the free ones; a tied one follows its
+        master.
+        """
         return (self.masters[:, None] == self.free).astype(float)
 
     def full(self, free_values: Float[np.ndarray, " f"], others: Vector | None = None) -> Vector:
-        """All parameters from the values of the free ones, the fixed ones from `others` (default: the start).
+        """All parameters (n) from the values of the free ones (f).
 
-        A tied parameter has the value of its master, not that in `others`.
+        Fixed parameters are taken from `others`, by default from the start values; a tied parameter has the value of
+        its master.
         """
         values = self.start if others is None else np.array(others, float)
         values[self.free] = free_values
@@ -147,7 +153,8 @@ class Model:
     def thicknesses(self) -> dict[int, Layer]:
         """The free parameters that are thicknesses of crystal layers, by position, each with its layer.
 
-        The layers next to the air behind each plate come first; a thickness shared by several layers is listed once.
+        The layer next to the air behind each plate comes first. A thickness that several layers share is listed once.
+        They are found by writing NaN into one parameter at a time and looking which layer has become NaN.
         """
         behind: dict[int, Layer] = {}
         inside: dict[int, Layer] = {}
@@ -162,7 +169,10 @@ class Model:
         return behind | {master: layer for master, layer in inside.items() if master not in behind}
 
     def gaps(self) -> tuple[int, ...]:
-        """Positions of the free thicknesses of air gaps ahead of plates, all from effects."""
+        """Positions of the free parameters that are thicknesses of air gaps ahead of plates; only effects have such.
+
+        They are found as in `thicknesses`, by writing NaN into one parameter at a time.
+        """
         if not any(plate.air_gaps for _, plate in _wave_plates(self.template.patched())):
             return ()
 
@@ -176,11 +186,13 @@ class Model:
         return tuple(i for i in self.free.tolist() if i in of_effects and moves_one(i))
 
     def named(self, values: Float[Any, " n"]) -> dict[str, Any]:
-        """A full vector of values by the names of the parameters."""
+        """A full vector of values (n) as a dictionary by name: {"pupil.magnification": 15.67, …}."""
         return dict(zip(self.names, values, strict=True))
 
     def instrument(self, values: Float[Any, " n"] | None = None) -> Instrument:
-        """The instrument at a full vector of values (default: start values); differentiable in arrays of JAX."""
+        """The instrument with a full vector of values (n, default: start values) in its tree; differentiable in arrays
+        of JAX.
+        """
         if values is None or not isinstance(values, jax.Array):
             values = np.asarray(self.start if values is None else values, float)
         return with_values(self.template)(values)
@@ -204,20 +216,20 @@ def make_model(
     instrument: Instrument,
     *,
     priors: Mapping[str, tuple[float, float]] | None = None,
-    frozen: Sequence[str] = (),
+    fixed: Sequence[str] = (),
 ) -> Model:
     """The model of an instrument at its nominal values with the priors of its declarations.
 
-    `priors` adds priors by name (catalogue errors of standards), `frozen` names fixed parameters.
+    `priors` adds priors by name (catalogue errors of standards), `fixed` names the parameters that are not fitted.
     """
     priors = dict(priors or {})
     parameters = [
-        dataclasses.replace(p.at(value, priors.pop(p.name, None)), free=p.name not in frozen)
+        dataclasses.replace(p.at(value, priors.pop(p.name, None)), free=p.name not in fixed)
         for p, value in zip(leaves(instrument), np.asarray(values_of(instrument)).tolist(), strict=True)
     ]
     names = [p.name for p in parameters]
     for master in [p.tie for p in parameters if p.tie is not None and p.tie not in names]:
         raise unknown_name("parameter to tie to", master, names)
-    for missing in [*priors, *(f for f in frozen if f not in names)]:
+    for missing in [*priors, *(f for f in fixed if f not in names)]:
         raise unknown_name("parameter", missing, names)
     return Model(name=name, template=jax.tree.map(array, instrument), parameters=tuple(parameters))

@@ -17,7 +17,7 @@ Curves = Mapping[str, FilterCurve]
 
 
 def standard_names(sources: Sources) -> tuple[str, ...]:
-    """Unique names of the values of standards, usable in parameter names: of the star, with the band if it is known."""
+    """Unique names of the values of standards, usable in parameter names: the star, with the band if it is known."""
     plain = [
         _usable(str(name)) or f"source{number}"
         for number, name in zip(sources.source, sources.name, strict=True)
@@ -41,7 +41,7 @@ def standards_of(sources: Sources, exposures: Exposures, filters: Curves) -> Sta
     """The standards of a set, with their catalogue values.
 
     They have a colour where a band is stated for any of them, or where they were observed in several filters; otherwise
-    a value is that of the only filter.
+    a value belongs to the only filter.
     """
     names, qu = standard_names(sources), np.stack([sources.q, sources.u])
     filter_names = _filters_seen(exposures)

@@ -22,14 +22,16 @@ from walop_jax.model import fold, light
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.ray import Ray
-from walop_jax.model.sources import Sight, Standards
+from walop_jax.model.sources import PointIllumination, Standards
 
 STOKES = ("I", "Q", "U", "V")
 
 
 @dataclasses.dataclass(frozen=True)
 class LightStage:
-    """The light at one place: rows of `value` are one beam or the arms, columns Stokes or cameras."""
+    """The light at one place of its path: rows of `value` are one beam or the arms, columns Stokes parameters or
+    cameras.
+    """
 
     name: str
     about: str
@@ -42,9 +44,9 @@ class LightStage:
 class Sightline:
     """A source and its path through the instrument; angles and field coordinates in degrees.
 
-    `q`, `u` are those of the source in the instrument frame (taken as catalogue values at ROTATOR 0); `clp_angle` is
-    NaN where the polariser is out; `setting` is a single row: the colour of the source, and the positions of the
-    optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
+    `q`, `u` are the Stokes parameters of the source in the instrument frame (taken as catalogue values at ROTATOR 0);
+    `clp_angle` is NaN where the polariser is out; `setting` is a single row: the colour of the source, and the
+    positions of the optics. Raises ValueError for a degree of polarisation above 1, and for several settings.
     """
 
     x: float = 0.0
@@ -82,22 +84,24 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     )
     x, y = jnp.asarray(sightline.x), jnp.asarray(sightline.y)
     source = jnp.asarray([len(instrument.standard.names) - 1])
-    beam = light.stokes(instrument, Sight(exposure, jnp.zeros((1, 2)), source, x, y))[0]
+    beam = light.stokes(instrument, PointIllumination(exposure, jnp.zeros((1, 2)), source, x, y))[0]
     stages = [_one("source", "polariser" if through else "sky", beam)]
 
     # One Stokes vector per node, and its average over the band.
     wavelength, weight = light.node_wavelengths(instrument, plan), light.band_weights(instrument, plan)[0]
     ray = Ray.entering(x, y, (wavelength, plan.conditions))
-    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states)
-    ahead, *inside = path.in_first_state()
+    path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.positions)
+    ahead, *inside = path.in_first_setting()
     nodes = jnp.broadcast_to(beam, (len(wavelength), 4))
     for (element, _), matrix in zip(path.common, ahead, strict=True):
         nodes = _through(matrix, nodes)
         if matrix is not None or element.moves:
             about = element.__doc__ or ""
             if element.moves is not None:
-                (angle,) = fold.positions(element, plan.moving, plan.states[:1])
-                about = "out of the beam" if angle is None else f"at {angle:g}°"
+                (angle,) = fold.angles_of(element, plan.moving, plan.positions[:1])
+                about = (
+                    "out of the beam" if angle is None else f"at {element.reading_in_words(_middle(angle))}"
+                )
             stages.append(_one(element.name, about, weight @ nodes))
     of_arms = [
         weight @ functools.reduce(lambda vector, matrix: _through(matrix, vector), arm, nodes)
@@ -110,7 +114,7 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     rows, throughput = light.band_rows(instrument, plan, x, y), instrument.throughput.at(x, y)
     unmixed = dataclasses.replace(instrument, cameras=dataclasses.replace(instrument.cameras, mixing=()))
     for name, about, vectors in (
-        ("analysers", "share of the light in each beam of its arm",
+        ("analysers", "fraction of the light in each beam of its arm",
          light.beams(instrument, rows) @ light.upstream(instrument, x, y)),
         ("cameras", "behind lenses, filter and detector of each camera",
          light.camera_vectors(unmixed, rows, throughput, x, y)),
@@ -118,6 +122,10 @@ def trace(instrument: Instrument, curve: FilterCurve, sightline: Sightline) -> t
     ):  # fmt: skip
         stages.append(LightStage(name, about, ("",), instrument.cameras.names, np.asarray(vectors @ beam)))
     return tuple(stages)
+
+
+def _middle(angle: fold.Angle) -> float:
+    return angle.middle if isinstance(angle, fold.Turning) else angle
 
 
 def _through(matrix: Float[Array, "... 4 4"] | None, nodes: Float[Array, "n 4"]) -> Float[Array, "n 4"]:

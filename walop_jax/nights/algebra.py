@@ -4,9 +4,10 @@ A unit (the exposures of one file in one night) says of the values θ of all par
 
     χ²_u(θ) = χ²_u + 2 g_uᵀ θ + θᵀ H_u θ,        θ = D_u x,
 
-with D_u the design of the laws for the unknowns x: `globals`, each with a function of time, and locals, that belong to
-one cell, which is a night, or several that a file joins. With A the equations of the globals, T those of the locals
-(block tridiagonal, as a random walk couples neighbours and nothing else does) and B the block between them,
+with D_u the design of the laws for the unknowns x. Unknowns are either `globals`, each with a function of time, or
+locals, which belong to one cell: a night, or several nights that a file joins. With A the equations of the globals, T
+the equations of the locals (block tridiagonal, as a random walk couples neighbours and nothing else does) and B the
+block between them,
 
     S_c  = T_c − C_c S_{c−1}⁻¹ C_cᵀ,      B'_c = B_c − C_c S_{c−1}⁻¹ B'_{c−1}          forwards
     K    = A − Σ B'_cᵀ S_c⁻¹ B'_c                                                      the globals
@@ -27,13 +28,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import linalg
 
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.laws import Form, Law
 
-Laws = Sequence[Law | None]
+LawOfEach = Sequence[Law | None]
 OfUnits = Float[np.ndarray, "u n"]
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 
 LOCAL = ("night", "file", "walk")  # bases of laws that give a parameter values of its own in every cell
 
@@ -63,7 +63,7 @@ class Equations:
 
 
 class Cell(NamedTuple):
-    """Unknowns of a cell: parameters, the units that each acts in, prior means and precisions."""
+    """Unknowns of a cell (a night, or several that a file joins): parameters, the units in which each acts, priors."""
 
     units: Int[np.ndarray, " v"]
     parameter: Int[np.ndarray, " k"]
@@ -75,19 +75,20 @@ class Cell(NamedTuple):
 class Eliminated(NamedTuple):
     """A cell in the elimination: its own block and border, coupling to the cell before, and both reduced."""
 
-    block: Matrix
-    border: Matrix
-    before: Matrix
-    factor: tuple[Matrix, bool]  # of S_c
-    left: Matrix  # B'_c
-    right: Vector  # r'_c
+    block: AnyMatrix
+    border: AnyMatrix
+    before: AnyMatrix
+    factor: tuple[AnyMatrix, bool]  # of S_c
+    left: AnyMatrix  # B'_c
+    right: AnyVector  # r'_c
 
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """The unknowns of equations under laws: what `solve` eliminates.
+    """The unknowns of equations under laws, which `solve` eliminates.
 
-    Of unknowns of all nights `at` are the parameters, `forms` the functions of time, `mean` and `precision` the priors.
+    For the unknowns of all nights, `at` are the parameters, `forms` the functions of time, `mean` and `precision` the
+    priors.
     """
 
     equations: Equations
@@ -102,9 +103,18 @@ class System:
 
     @classmethod
     def of(
-        cls, equations: Equations, laws: Laws, mean: Vector, width: Vector, means: Bool[np.ndarray, " n"]
+        cls,
+        equations: Equations,
+        laws: LawOfEach,
+        mean: AnyVector,
+        width: AnyVector,
+        means: Bool[np.ndarray, " n"],
     ) -> System:
-        """`mean` and `width` (inf: none) are the priors, about the origin; `means`: which have a value by default."""
+        """The unknowns that laws give equations.
+
+        `mean` and `width` (inf: none) are the priors, counted from the origin; `means` is true for parameters that have
+        a value by default.
+        """
         scale, middle = equations.scale, float(equations.mjd.mean())
         mean, precision = mean / scale, np.array([w**-2.0 for w in width / scale])
         every = [(i, *f) for i, law in enumerate(laws) if law for f in law.forms(bool(means[i]), middle)]
@@ -127,7 +137,9 @@ class System:
 
     @functools.cached_property
     def locals(self) -> list[tuple[int, int, int, Int[np.ndarray, " v"]]]:
-        """Of every unknown of a cell: the cell, its place in it, its parameter, the units that it acts in."""
+        """For every unknown of a cell: the cell, its position in the cell, its parameter, and the units in which it
+        acts.
+        """
         return [
             (c, k, i, cell.units[cell.covers[k] > 0])
             for c, cell in enumerate(self.cells)
@@ -136,7 +148,7 @@ class System:
 
     @functools.cached_property
     def states(self) -> dict[int, list[tuple[float, int, int]]]:
-        """The states of the walk of every parameter that walks, night by night: time (MJD), cell, place in the cell."""
+        """For every parameter that walks its states, night by night: time (MJD), cell, position in the cell."""
         states: dict[int, list[tuple[float, int, int]]] = {}
         for c, k, i, units in self.locals:
             if np.isfinite(self.rates[i]):
@@ -144,13 +156,15 @@ class System:
         return states
 
     def steps(self) -> Iterator[tuple[float, list[int], list[int]]]:
-        """The precision of every step of a walk, with cell and place of the states before and after it."""
+        """For every step of a walk its precision, and cell and position of the states before and after it."""
         for i, states in self.states.items():
             for (start, *before), (stop, *after) in itertools.pairwise(states):
                 yield 1.0 / (self.rates[i] ** 2 * (stop - start)), before, after
 
 
-def _cells(equations: Equations, laws: Laws, mean: Vector, precision: Vector, spread: Vector) -> list[Cell]:
+def _cells(
+    equations: Equations, laws: LawOfEach, mean: AnyVector, precision: AnyVector, spread: AnyVector
+) -> list[Cell]:
     """The cells in the order of time; the first state of a walk alone has the prior of its parameter."""
     local = {i: law for i, law in enumerate(laws) if law is not None and law.base in LOCAL}
     ends = np.ones(equations.night.max() + 1, bool)  # of a cell, with each night
@@ -177,14 +191,16 @@ def _cells(equations: Equations, laws: Laws, mean: Vector, precision: Vector, sp
 
 
 class UndeterminedError(ValueError):
-    """Nothing determines an unknown; `parameter` is the one, `unit` one of its units, None: of all nights."""
+    """Nothing determines an unknown of `parameter`, in the unit `unit` (None: in all nights)."""
 
     def __init__(self, parameter: int, unit: int | None) -> None:
         super().__init__("the nights do not determine a parameter under its law")
         self.parameter, self.unit = parameter, unit
 
 
-def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | None) -> tuple[Matrix, bool]:
+def _factored(
+    matrix: AnyMatrix, parameters: Int[np.ndarray, " k"], unit: int | None
+) -> tuple[AnyMatrix, bool]:
     """The Cholesky factor; `UndeterminedError` names the first parameter that has nothing left."""
     potrf: Any = linalg.lapack.dpotrf  # pyright: ignore[reportAttributeAccessIssue]
     factor, failed = potrf(matrix, lower=1, clean=1)
@@ -196,7 +212,7 @@ def _factored(matrix: Matrix, parameters: Int[np.ndarray, " k"], unit: int | Non
     return factor, True
 
 
-def cholesky_solve(factor: tuple[Matrix, Any], right: Any) -> Any:
+def cholesky_solve(factor: tuple[AnyMatrix, Any], right: Any) -> Any:
     """The inverse of a factored matrix (`scipy.linalg.cho_factor`) times right sides, of which there may be none."""
     return linalg.cho_solve(factor, right, check_finite=False) if right.size else right
 
@@ -243,7 +259,7 @@ def solve(system: System) -> Solution:
         right -= left.T @ gain[:, -1]
     factor = _factored(0.5 * (top + top.T), at, None)
     shared = cholesky_solve(factor, right)
-    values: list[Vector] = []
+    values: list[AnyVector] = []
     for c in reversed(range(len(done))):
         remainder = done[c].right - done[c].left @ shared
         if values:
@@ -252,7 +268,7 @@ def solve(system: System) -> Solution:
     return Solution(system, shared, tuple(values[::-1]), tuple(done), factor)
 
 
-def _block(system: System, cell: Cell) -> tuple[Matrix, Matrix, Vector]:
+def _block(system: System, cell: Cell) -> tuple[AnyMatrix, AnyMatrix, AnyVector]:
     """Own block, border and right side of a cell: priors and data, without the steps of walks."""
     e, p = system.equations, cell.parameter
     block = np.diag(cell.precision)
@@ -270,10 +286,10 @@ class Solution:
     """Unknowns that fit best, in units of `Equations.scale`, with their covariances."""
 
     system: System
-    shared: Vector
-    local: tuple[Vector, ...]
+    shared: AnyVector
+    local: tuple[AnyVector, ...]
     cells: tuple[Eliminated, ...]
-    factor: tuple[Matrix, bool]
+    factor: tuple[AnyMatrix, bool]
 
     @functools.cached_property
     def values(self) -> OfUnits:
@@ -309,14 +325,16 @@ class Solution:
         return [float(precision * step**2) for precision, step in pairs]
 
     @functools.cached_property
-    def covariance(self) -> Matrix:
+    def covariance(self) -> AnyMatrix:
         """Covariance of the global unknowns."""
         return cholesky_solve(self.factor, np.eye(len(self.shared)))
 
     @functools.cached_property
-    def smoothed(self) -> list[tuple[Matrix, Matrix]]:
-        """Of every cell the covariance of its unknowns, and that with the globals and the unknowns of the next cell."""
-        smoothed: list[tuple[Matrix, Matrix]] = []
+    def smoothed(self) -> list[tuple[AnyMatrix, AnyMatrix]]:
+        """For every cell the covariance of its unknowns, and their covariance with the globals and the unknowns of the
+        next cell.
+        """
+        smoothed: list[tuple[AnyMatrix, AnyMatrix]] = []
         beside = self.covariance  # of the globals and the next cell: none behind the last
         for c in reversed(range(len(self.cells))):
             entry = self.cells[c]
@@ -329,8 +347,8 @@ class Solution:
         return smoothed[::-1]
 
     def predict(
-        self, mjd: float, night: int | None = None, moved: Vector | float = 0.0
-    ) -> tuple[Vector, Matrix]:
+        self, mjd: float, night: int | None = None, moved: AnyVector | float = 0.0
+    ) -> tuple[AnyVector, AnyMatrix]:
         """All parameters at a time (MJD), from the origin, scaled, and their covariance.
 
         `night` is the number of the night that the time belongs to, None for one without equations; `moved` is added
@@ -377,7 +395,7 @@ class Solution:
         covariance[np.diag_indices(n)] += extra
         return value, covariance
 
-    def _elsewhere(self, i: int, at_time: Vector) -> tuple[float, float]:
+    def _elsewhere(self, i: int, at_time: AnyVector) -> tuple[float, float]:
         """A value of single nights or files where no data are, the globals having these functions, and its variance.
 
         Least squares of the values in a constant and the steps, bad nights and trends of the parameter: these may be
@@ -421,7 +439,11 @@ class Solution:
         return np.sqrt(np.clip(variance, 0.0, None))
 
 
-def _joined(covariance: Matrix, block: Matrix, others: Matrix) -> Matrix:
-    """A covariance with that of further unknowns, `block`; `others` is theirs with the first ones, and maybe more."""
+def _joined(covariance: AnyMatrix, block: AnyMatrix, others: AnyMatrix) -> AnyMatrix:
+    """A covariance extended by further unknowns.
+
+    `block` is the covariance of the further unknowns, `others` their covariance with the first ones, and maybe with
+    more.
+    """
     cross = others[:, : len(covariance)]
     return np.block([[covariance, cross.T], [cross, block]])

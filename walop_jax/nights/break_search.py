@@ -29,7 +29,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import YEAR, Law
 from walop_jax.model.parameters import Parameter
 from walop_jax.nights import changes
-from walop_jax.nights.algebra import Laws, Solution, UndeterminedError
+from walop_jax.nights.algebra import LawOfEach, Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, solved, with_breaks
 from walop_jax.nights.together import EffectAmplitude, Together
 
@@ -53,9 +53,9 @@ def both_beyond(u: float, rho: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k
 
 
 class Tried(NamedTuple):
-    """All changes of a solution: score and information by kind, cell and parameter (drifts have one cell).
+    """Scores and information of all changes of a solution, by kind, cell and parameter (drifts have one cell).
 
-    A value in all nights is no change, of which `always` is the information.
+    A value in all nights is no change; `always` is the information on it.
     """
 
     score: tuple[Float[np.ndarray, "_ n"], ...]
@@ -64,7 +64,7 @@ class Tried(NamedTuple):
 
     @classmethod
     def of(cls, solution: Solution, barred: Sequence[int] = ()) -> Tried:
-        """Scores of all changes; of those of `barred` parameters there is no information."""
+        """The scores of all changes; for `barred` parameters the information is 0."""
         mjd, n = solution.system.equations.mjd, len(solution.system.laws)
         course = np.repeat(((mjd - mjd.mean()) / YEAR)[:, None], n, axis=1)
         drift, of_drift = changes.weighted(solution, course, np.arange(n))
@@ -108,11 +108,12 @@ class Tried(NamedTuple):
 
 
 def find(
-    data: Together, laws: Laws, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
+    data: Together, laws: LawOfEach, catalogue: Sequence[EffectKind] = EFFECTS, carried: Carried | None = None
 ) -> tuple[tuple[Break, ...], tuple[Law | None, ...]]:
     """The breaks of a series, and the laws with them. Raises `UndeterminedError` where there is no solution.
 
-    Of names that explain a break as well as each other the first that is `carried` to stars is its law (None: all are).
+    Of several names that explain a break equally well, the first one that is `carried` to stars becomes a law (None:
+    all are carried).
     """
 
     def largest_beside(others: Sequence[Break], chance: float) -> Break | None:
@@ -135,7 +136,7 @@ def find(
     return tuple(sorted(breaks, key=lambda candidate: candidate.night)), with_breaks(data, laws, breaks)
 
 
-def _other_shapes(data: Together, laws: Laws) -> list[int]:
+def _other_shapes(data: Together, laws: LawOfEach) -> list[int]:
     """Candidates that are another shape of an effect that the model or a law has: a model holds one shape alone."""
     shapes: dict[str, tuple[int, int] | None] = {}
     for p, law in zip(data.parameters, laws, strict=True):
@@ -154,7 +155,9 @@ def _largest(
     catalogue: Sequence[EffectKind],
     carried: Carried | None,
 ) -> Break | None:
-    """The most significant change, of those alike the first that is carried; None where chance does as well."""
+    """The most significant change; of changes that look alike the first that is carried; None where chance does as
+    well.
+    """
     tried = Tried.of(solution, _other_shapes(data, solution.system.laws))
     kind, cell, i = tried.largest()
     z = tried.z(kind)
@@ -229,7 +232,7 @@ def _nights_needed(
     return math.inf if least < 1e-6 * best else float(max(0, math.ceil(held * (SURE**2 / least - 1.0))))
 
 
-def _held_out(data: Together, laws: Laws, entry: Break) -> float:
+def _held_out(data: Together, laws: LawOfEach, entry: Break) -> float:
     """Gain in χ² of every other night by the size that the others give; NaN where that cannot be asked."""
     i, halves = data.names.index(entry.name), []
     for odd in (0, 1):

@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import linalg
 
-from walop_jax.nights.algebra import Matrix, Solution, Vector, cholesky_solve
+from walop_jax.io.shapes import AnyMatrix, AnyVector
+from walop_jax.nights.algebra import Solution, cholesky_solve
 
-NOTHING = 1e-9  # share of its information below which a change is taken up by the laws altogether
+NOTHING = 1e-9  # fraction of its information below which a change is taken up by the laws altogether
 
 
 def _information(
-    of: Solution, direct: Vector, cross: Float[np.ndarray, "_ n"], taken: Vector
+    of: Solution, direct: AnyVector, cross: Float[np.ndarray, "_ n"], taken: AnyVector
 ) -> Float[np.ndarray, " n"]:
     """Direct information less what locals and globals take."""
     remaining = direct - taken
@@ -41,7 +42,7 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
     score, information = np.zeros((2, count, n)), np.zeros((2, count, n))
     cross, direct = np.zeros((globals_, n)), np.zeros(n)
     absorbed, border_taken = np.zeros(n), np.zeros((globals_, n))
-    behind: tuple[tuple[Matrix, bool], Matrix, Matrix] | None = None  # of the cell behind: U, B̃, c̃
+    behind: tuple[tuple[AnyMatrix, bool], AnyMatrix, AnyMatrix] | None = None  # of the cell behind: U, B̃, c̃
     for c in reversed(range(count)):
         cell, entry = system.cells[c], of.cells[c]
         cross_here = np.zeros((globals_, n))
@@ -81,7 +82,7 @@ def scan(of: Solution) -> tuple[Float[np.ndarray, "2 c n"], Float[np.ndarray, "2
 
 def weighted(
     of: Solution, weights: Float[np.ndarray, "u v"], parameter: Int[np.ndarray, " v"]
-) -> tuple[Vector, Matrix]:
+) -> tuple[AnyVector, AnyMatrix]:
     """Scores of changes of any course, and their information: `weights` are its values in every unit.
 
     The information is that of all of them together, off the diagonal what two have in common.

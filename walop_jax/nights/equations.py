@@ -4,9 +4,8 @@
 
 of the data alone: priors are laid on when nights are stacked, once. J holds the derivatives of the normalised residuals
 r, fluxes eliminated, with respect to the free parameters and to the amplitudes of effects that the model lacks (at 0):
-effects beyond the model can be tested afterwards without the data. So can the throughput that is held because the
-fluxes take it up: held in every night it is no gauge of what changes between them, as its camera may be the one that
-does.
+effects beyond the model can be tested afterwards without the data. So can the throughput that is fixed because the
+fluxes take it up: its camera may be the one that changes from night to night, and fixing it hides that.
 
 Nights follow from the exposures (`sky.nights`). A set of several nights is taken apart; each file and night is a unit
 of its own.
@@ -25,10 +24,11 @@ from walop_jax.data.records import CalibrationSet, Exposures, Site
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.fit.base_model import SKY_AND_STARS, gauges
 from walop_jax.fit.model_file import header_of
-from walop_jax.fit.search import nearer
+from walop_jax.fit.search import moved_within
 from walop_jax.io.errors import DataError, fail
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.columns import Change, Columns
+from walop_jax.likelihood.columns import Columns, SumOfSentences
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -36,7 +36,6 @@ from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import Parameter, leaves
 from walop_jax.model.specification import Model
-from walop_jax.nights.algebra import Matrix, Vector
 from walop_jax.nights.together import EffectAmplitude, Night, source_of
 from walop_jax.sky.moon import local_sidereal_time
 from walop_jax.sky.nights import night_of
@@ -97,16 +96,16 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 
-Candidates = dict[str, tuple[Parameter, Change]]
+CandidateTable = dict[str, tuple[Parameter, SumOfSentences]]
 """Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
 
 def candidates_of(
     model: Model, exposures: Exposures, catalogue: Sequence[EffectKind] = EFFECTS
-) -> Candidates:
+) -> CandidateTable:
     """Amplitudes of the effects that a model lacks, and its gauges, with the change that each is to first order."""
     context = effect_context(model.template, exposures)
-    candidates: Candidates = {}
+    candidates: CandidateTable = {}
     for kind in catalogue:
         if kind.is_structural() or kind.name in (*OF_ONE_SET, *model.effect_names):
             continue
@@ -127,8 +126,8 @@ def candidates_of(
 
 
 def with_candidates(
-    likelihood: Likelihood, values: Vector, candidates: Candidates
-) -> tuple[float, Vector, Matrix]:
+    likelihood: Likelihood, values: AnyVector, candidates: CandidateTable
+) -> tuple[float, AnyVector, AnyMatrix]:
     """χ², gradient and matrix of the data of a table in free parameters and candidates (0: cannot be computed)."""
     model = likelihood.model
     changes = [change for _, change in candidates.values()]
@@ -157,7 +156,7 @@ def with_candidates(
 
 
 def model_hash(model: Model) -> str:
-    """Of all that nights must have in common: instrument, physics, effects, ties and values that are held."""
+    """A hash of what all nights must have in common: instrument, physics, effects, ties, fixed values."""
     header = header_of(model)
     fixed = (p for p in model.parameters if (p.tie or not p.free) and p.part not in SKY_AND_STARS)
     held = [f"{p.name} {p.tie or repr(p.start)}" for p in fixed]
@@ -168,8 +167,8 @@ def model_hash(model: Model) -> str:
 def night_equations(
     calset: CalibrationSet,
     model: Model,
-    values: Vector | Mapping[str, float],
-    changes: Candidates | None = None,
+    values: AnyVector | Mapping[str, float],
+    changes: CandidateTable | None = None,
     *,
     number: int | None = None,
     own: bool = False,
@@ -177,10 +176,10 @@ def night_equations(
 ) -> list[Night]:
     """The nights of a set, linearised at values of the parameters: a full vector, or by name (others: start values).
 
-    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is asked for. Nights
-    whose `own` minimum is farther from the values than noise explains are linearised closer to it. `sets` is
-    how many such sets come. Of sets too large for a table of derivatives no candidates are kept. Raises `DataError` as
-    `split` does, and where the model has no finite counts.
+    `changes` are the candidates (None: `candidates_of` each night), `number` the only night that is wanted. With `own`,
+    nights whose minimum is farther from the values than noise explains are linearised closer to it. `sets` is how many
+    such sets come. For sets too large for a table of derivatives no candidates are kept. Raises `DataError` as `split`
+    does, and where the model has no finite counts.
     """
     if isinstance(values, Mapping):
         values = np.array([values.get(p.name, p.start) for p in model.parameters])
@@ -191,18 +190,18 @@ def night_equations(
             continue
         likelihood, point = Likelihood.of(subset, model, sets=sets), values
         if own:
-            point = nearer(likelihood, values, np.sqrt(OWN * len(model.free)))
+            point = moved_within(likelihood, values, np.sqrt(OWN * len(model.free)))
         if likelihood.layout.large:
             terms, _ = likelihood.data_terms(point)
             select = model.selection()
             chi2, gradient, matrix = terms.data, select.T @ terms.gradient, select.T @ terms.matrix @ select
-            beyond, census = {}, terms.census
+            beyond, used_data = {}, terms.used_data
         else:
             beyond = (
                 candidates_of(model, subset.exposures, known_effects(model)) if changes is None else changes
             )
             chi2, gradient, matrix = with_candidates(likelihood, point, beyond)
-            census = likelihood.census
+            used_data = likelihood.used_data
         if not (np.isfinite(chi2) and np.isfinite(gradient).all() and np.isfinite(matrix).all()):
             what = "the model has no finite counts or derivatives where the nights meet"
             advice = (
@@ -222,8 +221,8 @@ def night_equations(
                 filters=tuple(np.unique(e.filter).tolist()),
                 source=source,
                 sha256=data_hash(calset),
-                n_data=census.n_data,
-                dof=round(float(census.rows @ likelihood.data_per_row)),
+                n_data=used_data.n_data,
+                dof=round(float(used_data.rows @ likelihood.data_per_row)),
                 chi2=chi2,
                 parameters=(*(model.parameters[i] for i in model.free), *(p for p, _ in beyond.values())),
                 candidates=len(beyond),

@@ -27,7 +27,7 @@ from walop_jax.likelihood.workers import mapped
 from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.specification import Model
 from walop_jax.nights.equations import (
-    Candidates,
+    CandidateTable,
     candidates_of,
     model_hash,
     night_equations,
@@ -38,25 +38,28 @@ from walop_jax.nights.together import Night, source_of
 from walop_jax.posterior.run import Run
 
 SKETCH = 512  # measurements by which sets are compared
-COPIED = 0.02  # their share that no two sets have in common by chance
+COPIED = 0.02  # their fraction that no two sets have in common by chance
 
 
 class Data(NamedTuple):
-    """Data that nights can be made of at any values: a set, its file or a RUN; hash; model (None: that of `like`)."""
+    """Data of which nights can be made at any values of the parameters.
+
+    `source` is a set, the path of one or a RUN; `sha256` its hash; `model` None stands for the model of `like`.
+    """
 
     source: CalibrationSet | Path | Run
     sha256: str
     model: Model | None = None
 
     def read(self) -> CalibrationSet:
-        """The set."""
+        """The calibration set, read if it is a file."""
         if isinstance(self.source, CalibrationSet):
             return self.source
         return self.source.calset if isinstance(self.source, Run) else read_calibration_set(self.source)
 
 
 class Task(NamedTuple):
-    """Nights to be made of `data`: those near their own minimum, or `night` once more, at `values`."""
+    """Nights to be made of `data`, each near its own minimum; or one `night` made again, at `values`."""
 
     data: Data
     night: Night | None = None
@@ -83,7 +86,7 @@ class Maker:
     folder: Path | None
     count: int = 1
     """Number of sets: programs for many are optimised."""
-    _candidates: dict[tuple[str, ...], Candidates] = dataclasses.field(default_factory=dict)
+    _candidates: dict[tuple[str, ...], CandidateTable] = dataclasses.field(default_factory=dict)
     _sets: dict[str, tuple[CalibrationSet, Model]] = dataclasses.field(default_factory=dict)
 
     def make(self, task: Task) -> Made:
@@ -139,7 +142,7 @@ class Maker:
             self._sets[data.sha256] = read
         return read
 
-    def _candidates_of(self, model: Model, calset: CalibrationSet) -> Candidates:
+    def _candidates_of(self, model: Model, calset: CalibrationSet) -> CandidateTable:
         # They depend on cameras, standards and the effects of the model alone: listing them takes a while.
         key = (*model.names, *model.effect_names)
         if key not in self._candidates:
@@ -169,7 +172,7 @@ def made(maker: Maker, executor: Executor | None, tasks: Sequence[Task]) -> Iter
 def sketch(calset: CalibrationSet, table: TableIntensities) -> frozenset[int]:
     """Sketch of the measurements of a set, whatever their times: the same ones have the same hashes (MinHash).
 
-    The smallest of the hashes of (X, Y, counts); the share that two sketches have in common is that of the sets
+    The smallest of the hashes of (X, Y, counts); the fraction that two sketches have in common is that of the sets
     (Broder 1997).
     """
     rows = table.used & ~calset.exposures.flux_known[table.exposure]

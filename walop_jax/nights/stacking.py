@@ -31,7 +31,7 @@ from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.laws import Law
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.algebra import Laws, OfUnits, Solution, UndeterminedError
+from walop_jax.nights.algebra import LawOfEach, OfUnits, Solution, UndeterminedError
 from walop_jax.nights.break_search import find as breaks_of
 from walop_jax.nights.breaks import solved
 from walop_jax.nights.equations import data_hash
@@ -53,7 +53,7 @@ from walop_jax.posterior.run import Run
 AtHand = Mapping[tuple[str, int], Data]
 Make = Callable[[Sequence[Task]], Iterator[list[Night]]]
 
-Given = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
+NightLike = FitResult | CalibrationSet | Night | Run | str | os.PathLike[str]
 """Sources of nights: a fit, a set, a night, or a path: of a set, of a RUN, of a SURVEY or of its nights."""
 
 FAR = 0.02  # standard errors from the solution up to which a night need not be linearised again
@@ -63,7 +63,7 @@ PARTIAL = "partial"  # folder of the nights that are made, until all are
 
 
 def stack(
-    nights: Sequence[Given],
+    nights: Sequence[NightLike],
     laws: Mapping[str, Law | Mapping[str, Any]] | str | os.PathLike[str] | None = None,
     *,
     like: Calibration | FitResult | None = None,
@@ -151,7 +151,7 @@ def events_of(table: Any) -> list[tuple[float, str]]:
     return list(zip(mjd.tolist(), map(str, words), strict=True))
 
 
-def _opened(given: Given, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data | None]:
+def _opened(given: NightLike, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data | None]:
     """Nights that are kept, or a fit and data that they can be made of."""
     if isinstance(given, Night):
         return Kept([given]), None
@@ -173,7 +173,7 @@ def _opened(given: Given, catalogue: Sequence[EffectKind]) -> tuple[Kept, Data |
         return Kept(), Data(path.resolve(), hashlib.file_digest(raw, "sha256").hexdigest())
 
 
-def _settled(data: Together, laws: Laws, at_hand: AtHand, make: Make) -> tuple[Together, Solution, bool]:
+def _settled(data: Together, laws: LawOfEach, at_hand: AtHand, make: Make) -> tuple[Together, Solution, bool]:
     """Linearise nights at the common solution until that would not move it by `EXACT` errors; whether it would not.
 
     A missing effect may lead ever farther away: the search ends where all nights come no closer.
@@ -203,7 +203,7 @@ def _distances(data: Together, solution: Solution, references: OfUnits, at_hand:
 def _linearised(
     data: Together,
     solution: Solution,
-    laws: Laws,
+    laws: LawOfEach,
     again: Collection[int],
     at_hand: AtHand,
     make: Make,
@@ -257,4 +257,4 @@ def _carried(like: Calibration, catalogue: Sequence[EffectKind], candidate: Para
         return True
     template = like.model.template
     changes = kind.neutral(effect_context(template, like.exposures)).first_order(template)
-    return all(change.of_stars for orders in changes for _, change in orders)
+    return all(change.applies_to_catalogue for orders in changes for _, change in orders)

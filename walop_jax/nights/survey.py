@@ -6,7 +6,7 @@ It is valid from half a day before the first exposure until walks and drifts hav
 (the local inverse has a condition number below 10); at the latest after as long again as the nights span, as nothing
 vouches for more, and not before half a day after the last exposure. Validity is half-open, and parted, without gaps,
 where something breaks. Between the last exposure before a break that was found and the first after it, it may have
-happened at any time: the calibration takes a share of it there, and its variance.
+happened at any time: the calibration takes a fraction of it there, and its variance.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from walop_jax.calibration.accuracy import (
     NODES,
     SIZE,
     TOLERANCE,
-    judged,
+    field_measured,
     measures_u,
     p_errors,
     reached,
@@ -35,11 +35,12 @@ from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.io.text import per_cent, value_and_error
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.model.laws import Law
-from walop_jax.nights.algebra import Matrix, Solution, Vector
+from walop_jax.nights.algebra import Solution
 from walop_jax.nights.breaks import Break, among_globals
 from walop_jax.nights.changes import scan
 from walop_jax.nights.together import EffectAmplitude, Together
@@ -55,12 +56,13 @@ SUSPECT = 5.0  # excess of χ² of a night over its expectation, in its own stan
 class Survey(Drawn):
     """Nights under laws: `at(mjd)` is the calibration of a moment, `tracks` every parameter against time.
 
-    `laws` are those of every parameter and candidate (None: absent), `breaks` the detected ones, now laws. `like` is a
-    calibration of the same model, from which field, filters, site and parameters that are held are taken (None: there
-    is no calibration of a moment); `doubts` are those beside χ²; `events` the notes of users (MJD, words).
+    `laws` are the laws of every parameter and candidate (None: absent), `breaks` the breaks that were found, which are
+    laws now. `like` is a calibration of the same model, from which field, filters, site and fixed parameters are taken
+    (None: there is no calibration of a moment). `doubts` are doubts beside χ²; `events` the notes of users (MJD,
+    words).
     """
 
-    first_figure = "tracks"
+    _first_figure = "tracks"
 
     data: Together
     laws: tuple[Law | None, ...]
@@ -73,7 +75,7 @@ class Survey(Drawn):
     # ----------------------------------------------------------------------------------------------- how good
 
     @functools.cached_property
-    def excess(self) -> Vector:
+    def excess(self) -> AnyVector:
         """(χ² − dof)/√(2 dof) of every night: the distance of its data from the laws."""
         dof = np.array([night.dof for night in self.data.nights], float)
         return (self.solution.unit_chi2 - dof) / np.sqrt(2.0 * np.maximum(dof, 1.0))
@@ -82,9 +84,9 @@ class Survey(Drawn):
     def _counts(self) -> tuple[float, int]:
         """χ² of data and priors, and its degrees of freedom.
 
-        These are data less fluxes, plus priors, less the unknowns that these determine. Loose widths only keep the
-        search inside: they are no knowledge, what they add to χ² is left out, and an unknown that nothing else
-        determines counts as none, as in a fit (`likelihood.inverses.determined`).
+        Degrees of freedom are data less fluxes, plus priors, less the unknowns that these determine. Weak pulls only
+        keep the search inside and are no knowledge: what they add to χ² is left out, and an unknown that nothing else
+        determines is not counted, as in a fit (`likelihood.inverses.determined`).
         """
         solution, system = self.solution, self.solution.system
         unknowns = [(group.mean, group.precision) for group in (system, *system.cells)]
@@ -122,7 +124,7 @@ class Survey(Drawn):
         stars = ""
         if self._matrix is not None:
             error = per_cent(self.error_of_p(self.last))
-            stars = f"{error} % or better in {judged(self._matrix[3])}, on the last night"
+            stars = f"{error} % or better in {field_measured(self._matrix[3])}, on the last night"
         return Verdict(
             chi2, dof, n_data, 1.0, True, tuple(against), structure=structure,
             subject=f"Survey of {nights[0].instrument}", stars=stars,
@@ -172,7 +174,8 @@ class Survey(Drawn):
 
     @functools.cached_property
     def _matrix(self) -> OfMatrix | None:
-        """Matrix, derivatives and covariance of structure where one exposure measures u; the share where it does not.
+        """Matrix, derivatives and covariance of structure where one exposure measures u, and the fraction of the field
+        where it does not.
 
         None where p is not measured.
         """
@@ -191,7 +194,7 @@ class Survey(Drawn):
 
     @property
     def changing(self) -> dict[str, Law]:
-        """The laws other than that of a parameter that all nights share."""
+        """The laws of parameters that not all nights share."""
         by_name = zip(self.data.names, self.laws, strict=True)
         return {name: law for name, law in by_name if law is not None and law.per != ("shared",)}
 
@@ -226,7 +229,7 @@ class Survey(Drawn):
         same = np.flatnonzero(np.array(of_nights[::2]) == evening)
         return int(self.data.equations.night[same[0]]) if len(same) else None
 
-    def values_at(self, mjd: float) -> tuple[Vector, Matrix]:
+    def values_at(self, mjd: float) -> tuple[AnyVector, AnyMatrix]:
         """All parameters and candidates (`data.names`) at a moment (MJD, UTC), and their covariance."""
         data, solution, scale = self.data, self.solution, self.data.equations.scale
         moved, scatter = np.zeros(len(solution.shared)), np.zeros(len(scale))
@@ -243,14 +246,14 @@ class Survey(Drawn):
 
         Raises `DataError` outside `span` unless `force` is given, and where there is no calibration to begin with.
         """
-        (start, stop), against = self.span, self.verdict.against
+        (start, stop), against = self.span, self.verdict.doubts
         if not start <= mjd < stop:
             what = f"MJD {mjd:.3f} is outside the validity of the survey, {start:.3f} to {stop:.3f}"
             if not force:
                 advice = "calibrate a night nearer to it, or give --force (force=True in Python)"
                 raise fail(what, advice=advice)
             against = (*against, Doubt(Quality.VALIDITY_FORCED, what, blocking=False))
-        verdict = dataclasses.replace(self.verdict, against=against)
+        verdict = dataclasses.replace(self.verdict, doubts=against)
         return dataclasses.replace(self._product(mjd), verdict=verdict)
 
     def _product(self, mjd: float) -> Calibration:
@@ -307,8 +310,8 @@ class Survey(Drawn):
     def tracks(self) -> Any:
         """Every parameter in every night as an astropy table: value and error under its law, and deviation.
 
-        DEVIATION is by how much the parameter would differ in that night, or in nights that a file joins, if it alone
-        were free to differ there, with everything else fitted anew; NaN where its law takes that up.
+        DEVIATION is by how much the parameter would differ in that night, or in the nights that a file joins, if it
+        alone were free to differ there, with everything else fitted anew; NaN where its law takes that up.
         """
         data, solution = self.data, self.solution
         shape, scale = (len(data.nights), len(data.names)), data.equations.scale

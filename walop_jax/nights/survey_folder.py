@@ -22,7 +22,7 @@ from walop_jax.io.names import NIGHTS, PRODUCT, REFERENCE, SURVEY, TRACKS
 from walop_jax.io.run_folder import RunFolder
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.laws import Law, laws_of, resolved
-from walop_jax.nights.algebra import Laws, Solution, UndeterminedError
+from walop_jax.nights.algebra import LawOfEach, Solution, UndeterminedError
 from walop_jax.nights.breaks import Break, at_solution, solved, with_breaks
 from walop_jax.nights.night_file import nights_in, write_nights
 from walop_jax.nights.survey import Survey
@@ -119,7 +119,7 @@ def laws_of_all(data: Together, laws: Mapping[str, Law | Mapping[str, Any]]) -> 
     return every
 
 
-def breaks_in(data: Together, laws: Laws, kept: Iterable[Kept]) -> list[Break]:
+def breaks_in(data: Together, laws: LawOfEach, kept: Iterable[Kept]) -> list[Break]:
     """The breaks that come with nights and are laws of them still."""
     every = (entry for source in kept for entry in source.breaks)
     return [entry for entry in every if with_breaks(data, laws, [entry]) == laws]
@@ -127,7 +127,7 @@ def breaks_in(data: Together, laws: Laws, kept: Iterable[Kept]) -> list[Break]:
 
 def survey_of(
     data: Together,
-    laws: Laws,
+    laws: LawOfEach,
     solution: Solution,
     like: Calibration | None,
     doubts: Iterable[Doubt],
@@ -179,7 +179,7 @@ def doubts_about(fits: Sequence[Calibration], data: Together) -> list[Doubt]:
     return doubts
 
 
-def _check_filters(data: Together, laws: Laws) -> None:
+def _check_filters(data: Together, laws: LawOfEach) -> None:
     first = data.nights[0]
     pairs = zip(laws, data.parameters, strict=True)
     free = {law.base for law, p in pairs if law and p.name.startswith("throughput.")}

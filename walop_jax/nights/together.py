@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.io.errors import fail
+from walop_jax.io.shapes import AnyVector
 from walop_jax.model.parameters import Parameter
-from walop_jax.nights.algebra import Equations, Vector
+from walop_jax.nights.algebra import Equations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,10 +64,11 @@ class Night:
 
 @dataclasses.dataclass(frozen=True)
 class EffectAmplitude(Parameter):
-    """An amplitude of an effect (`part`) that a model lacks, of one `shape`: the group of its probes and the member.
+    """An amplitude of an effect (`part`) that a model lacks, at one `shape`: the number of its group of probes and of
+    the member.
 
-    `in_model` is its name in a model that has the effect. In files the name holds all of it: EFFECT#GROUP.LEAF#MEMBER,
-    without zeros.
+    `in_model` is its name in a model that has the effect. In files the name says it all: EFFECT#GROUP.LEAF#MEMBER,
+    zeros left out.
     """
 
     shape: tuple[int, int] = (0, 0)
@@ -74,14 +76,14 @@ class EffectAmplitude(Parameter):
 
     @classmethod
     def of(cls, leaf: Parameter, effect: str, group: int | None, member: int) -> EffectAmplitude:
-        """That of a leaf of a probe; `group` is None where the effect has a single one."""
+        """The amplitude of a leaf of a probe; `group` is None where the effect has a single one."""
         of_group, of_member = f"#{group}" * (group is not None), f"#{member}" * bool(member)
         name = f"{effect}{of_group}.{leaf.name}{of_member}"
         return cls.read(dataclasses.replace(leaf, name=name, start=0.0))
 
     @classmethod
     def read(cls, parameter: Parameter) -> EffectAmplitude:
-        """That of a parameter of a file."""
+        """The amplitude that a parameter of a file stands for."""
         head, _, leaf = parameter.name.partition(".")
         (part, _, group), (leaf, _, member) = head.partition("#"), leaf.partition("#")
         fields: dict[str, Any] = vars(parameter) | {"part": part}
@@ -103,9 +105,9 @@ class Together:
     nights: tuple[Night, ...]
     parameters: tuple[Parameter, ...]
     candidates: int
-    origin: Vector
-    mean: Vector
-    width: Vector
+    origin: AnyVector
+    mean: AnyVector
+    width: AnyVector
     equations: Equations
 
     @property
@@ -140,7 +142,7 @@ class Together:
 
     @property
     def gauge(self) -> Bool[np.ndarray, " n"]:
-        """True for candidates that are held in the model, at a value: only changes of them can be seen."""
+        """True for candidates that are fixed in the model at a value, so that only changes of them can be seen."""
         return ~self.has_value & np.array([p.start != 0.0 for p in self.parameters], bool)
 
 

@@ -33,18 +33,25 @@ from walop_jax.paper import polynomial
 from walop_jax.paper.polynomial import PaperCalibration, fit_polynomials, measured_qu
 from walop_jax.paper.wavelength import DEGREE, TEMPERATURES, colour_spread, efficiencies, spread_document
 from walop_jax.science import star_errors
-from walop_jax.science.star_errors import MethodErrors, Truth, Vectors, determinant, statistics, transmitted
+from walop_jax.science.star_errors import (
+    MethodErrors,
+    RowVectors,
+    Truth,
+    determinant,
+    statistics,
+    transmitted,
+)
 
 LINES = 81  # wavelengths across the filter
 
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """Origin of Δq, Δu, point by point.
+    """Where Δq and Δu of Paper II come from, point by point (p, 2).
 
-    `found` as in the paper; `along` what the coefficients' departure along the weakest direction of the design
-    matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` Δ of a fit to noise-free
-    polarised states; `anchored` Δ when one unpolarised exposure is added to those of the set.
+    `found` are Δq, Δu as in the paper; `along` is what the departure of the coefficients along the weakest direction of
+    the design matrix makes of unpolarised light, `along_three` along its three weakest; `noiseless` is Δ of a fit to
+    noise-free polarised states; `anchored` is Δ when one unpolarised exposure is added to the exposures of the set.
     """
 
     found: Float[np.ndarray, "p 2"]
@@ -55,7 +62,7 @@ class Offsets:
     condition: Float[np.ndarray, " p"]
 
     def document(self) -> dict[str, Any]:
-        """Sizes in per cent, and the share of the variance of Δ that the weakest direction explains."""
+        """Sizes in per cent, and the fraction of the variance of Δ that the weakest direction explains."""
 
         def size(values: Float[np.ndarray, "p 2"]) -> dict[str, float]:
             sizes = np.append(np.sqrt(np.mean(values**2, axis=0)), np.abs(values).max(axis=0))
@@ -79,7 +86,7 @@ def offsets(
     paper: PaperCalibration,
     measured: Float[np.ndarray, "p e 2"],
     states: Float[np.ndarray, "e 2"],
-    reference: Vectors,
+    reference: RowVectors,
     stars: Float[np.ndarray, "n 2"],
 ) -> Offsets:
     """The reason for Δ shown on data: `measured` are the polarised states, `reference` the instrument."""
@@ -113,11 +120,11 @@ def offsets(
 class Comparison(Drawn):
     """Paper II's method and the joint model on one calibration set.
 
-    `grid` has the errors at the points that the polynomials were made for, `between` those elsewhere; `truth` says
-    whether the joint model was held against a truth there (its covariance otherwise).
+    `grid` has the errors at the points that the polynomials were made for, `between` the errors elsewhere; `truth` says
+    whether the joint model was compared with a truth there (with its covariance otherwise).
     """
 
-    first_figure = "histogram"
+    _first_figure = "histogram"
 
     paper: PaperCalibration
     offsets: Offsets
@@ -247,11 +254,14 @@ def compare(
     teff = float(np.median(calset.exposures.teff[exposures]))
     analysis, setting = AnalysisVectors(calibration), Settings.default(1, filter_name)
 
-    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> Vectors:
+    def vectors(x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"]) -> RowVectors:
         return analysis.coloured(setting, x, y, np.full(len(x), teff))
 
     def errors_at(
-        x: Float[np.ndarray, " p"], y: Float[np.ndarray, " p"], local: PaperCalibration, true: Vectors | None
+        x: Float[np.ndarray, " p"],
+        y: Float[np.ndarray, " p"],
+        local: PaperCalibration,
+        true: RowVectors | None,
     ) -> MethodErrors:
         joint = vectors(x, y)
         reference = joint if true is None else true
@@ -292,7 +302,7 @@ def _moon(
     calset: CalibrationSet,
     calibration: Calibration,
     paper: PaperCalibration,
-    reference: Vectors,
+    reference: RowVectors,
     stars: Float[np.ndarray, "n 2"],
 ) -> dict[str, Any] | None:
     """Verdicts on the Moon patches, and the errors that the full-Moon scheme leaves at the grid points."""

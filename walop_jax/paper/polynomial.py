@@ -205,10 +205,10 @@ DOUBTED_BELOW = 0.5  # weight below which a patch is pointed out
 
 @dataclasses.dataclass(frozen=True)
 class Patches:
-    """Moon patches judged one by one.
+    """Moon patches, each judged by itself.
 
-    `exposure` is their row in the set; `scale` s_m and `offset` c_m of the fit, `flatness` χ²/dof, `departure` D_m
-    and `weight` as above; `depolarisation` the δ that the patches agree on.
+    `exposure` is the row of each in EXPOSURES; `scale` s_m and `offset` c_m of the fit, `flatness` χ²/dof, `departure`
+    D_m and `weight` as in the head of this file; `depolarisation` is the δ that the patches agree on.
     """
 
     exposure: Int[np.ndarray, " m"]
@@ -309,8 +309,8 @@ def full_moon_scheme(
 ) -> PaperCalibration:
     """Paper II's polynomials with Δq, Δu from standards and Moon patches instead of test stars.
 
-    `weight` are those of the Moon exposures with the calibration plate out, in their order (default: equal). Raises
-    `DataError` if there are no standards at the centres of the boxes, or no Moon exposures.
+    `weight` are the weights of the Moon exposures with the calibration plate out, in their order (default: equal).
+    Raises `DataError` if there are no standards at the centres of the boxes, or no Moon exposures.
     """
     e = calset.exposures
     block = calset.intensities.block(0, len(calset.points))

@@ -72,7 +72,7 @@ def colour_spread(
 
 
 def spread_document(spread: Float[np.ndarray, "p 2"]) -> dict[str, Any]:
-    """Median and maximum in per cent, and the shares of the field below 0.01 % and 0.05 %."""
+    """Median and maximum in per cent, and the fractions of the field below 0.01 % and 0.05 %."""
     document = {}
     for name, values in zip("qu", spread.T, strict=True):
         shares = {"share_negligible": values < NEGLIGIBLE, "share_below_sensitivity": values < GOAL}
@@ -91,7 +91,7 @@ def _plates(
     instrument: Instrument, plan: Plan, x: Float[Array, ""], y: Float[Array, ""]
 ) -> Float[Array, "w n 4 4"]:
     ray = Ray.entering(x, y, (light.node_wavelengths(instrument, plan), plan.conditions))
-    arms = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.states).arms
+    arms = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, plan.moving, plan.positions).arms
     stations = [station for arm in arms for station in arm if isinstance(station[0], WavePlate)]
     return jnp.stack([jnp.asarray(element.mueller(ray_at)) for element, ray_at in stations])
 

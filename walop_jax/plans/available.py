@@ -1,7 +1,6 @@
 """Possible observations and their costs: filters, plates, exposure times, visibility, overheads.
 
-Their file (docs: files) is that of an observing plan, of which the polariser angles are ignored, with a few entries
-more.
+Their file (docs: files) is the file of an observing plan with a few more entries; its polariser angles are ignored.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,7 +63,8 @@ Both hold 22.5, 45 and 90, at which cameras are dark and the information of an e
 
 
 class CandidateExposure(NamedTuple):
-    """Exposures that differ in the angle of the polariser, or in the Moon patch or standard: each one of `stops`.
+    """Exposures that differ in the angle of the polariser alone, or in the Moon patch or standard: one for each of
+    `stops`.
 
     Angles of the polariser repeat themselves after `turn` (deg): half a turn, or a whole one where it is not ideal.
     """
@@ -78,7 +78,7 @@ class CandidateExposure(NamedTuple):
 
     @property
     def setting(self) -> tuple[Any, ...]:
-        """Settings that have to be changed for another choice."""
+        """What has to be changed for another choice: filter and positions of the moving elements."""
         return (self.filter, *self.positions.values())
 
     def number(self, angle: float) -> int:
@@ -86,18 +86,19 @@ class CandidateExposure(NamedTuple):
         return round(angle % self.turn / STEP) % len(self.stops)
 
     def over(self, turn: float) -> CandidateExposure:
-        """The same with the polariser on the grid over a turn (deg)."""
+        """These exposures with the polariser on the grid over a turn (deg)."""
         if self.kind != "clp":
             return self
         angles = (STEP * np.arange(round(turn / STEP))).tolist()
         stops = tuple(dataclasses.replace(self.stops[0], polariser_angle=angle) for angle in angles)
         return self._replace(stops=stops, turn=turn)
 
-    def text(self) -> str:
-        """In a few words."""
-        stands = {p: "out" if a is None else f"{a:g}°" for p, a in self.positions.items()}
-        places = (f"{p} {where}" for p, where in stands.items())
-        return ", ".join([self.kind, self.filter, *places, f"{self.seconds:g} s"])
+    def in_words(self, reading_in_words: Callable[[str, float], str]) -> str:
+        """The choice in a few words: clp, SDSS-r, CHWP 45°, 30 s; by `Instrument.reading_in_words`."""
+        readings = (
+            f"{p} {'out' if a is None else reading_in_words(p, a)}" for p, a in self.positions.items()
+        )
+        return ", ".join([self.kind, self.filter, *readings, f"{self.seconds:g} s"])
 
 
 def with_stops(plan: ObservingPlan, stops: Iterable[Stop], **changes: Any) -> ObservingPlan:
@@ -188,8 +189,8 @@ class Available:
                 for seconds in self.seconds.get(kind, (EXPOSED[kind],)):
                     angle = 0.0 if kind == "clp" else None
                     blank = Stop(angle, name, stops[0], moving, kind=kind, seconds=seconds)
-                    indoors = kind == "clp" or (kind == "lamp" and plan.lamps)
-                    members = (blank,) if indoors else tuple(self._members(blank, up.get(kind, ())))
+                    no_sky = kind == "clp" or (kind == "lamp" and plan.lamps)
+                    members = (blank,) if no_sky else tuple(self._members(blank, up.get(kind, ())))
                     if members:
                         one = CandidateExposure(kind, name, where, seconds, members)
                         candidates.append(one.over(one.turn))
@@ -202,7 +203,7 @@ class Available:
                 yield dataclasses.replace(blank, number=number, place=place)
 
     def _up(self, kind: str, total: int) -> tuple[tuple[int, ...], list[str]]:
-        """Numbers of those that are up in the dark, and remarks on the others."""
+        """Numbers of the targets that are up in the dark, and remarks on the others."""
         if not total:
             return (), []
         plan, what = self.plan, "Moon patches" if kind == "moon" else "standards"
@@ -254,7 +255,7 @@ class Available:
         return (text,) if lost else ()
 
     def in_whole_seconds(self) -> Available:
-        """The same with exposure times of whole seconds, which schedules need."""
+        """These observations with exposure times of whole seconds, which schedules need."""
         rounded = {k: [max(1.0, float(round(t))) for t in ts] for k, ts in self.seconds.items()}
         return dataclasses.replace(self, seconds={k: tuple(dict.fromkeys(ts)) for k, ts in rounded.items()})
 

@@ -57,9 +57,10 @@ TARGET_GRID = 9  # field points along each axis at which the error of p is asked
 class Criterion:
     """Linear functions of the parameters, `targets` (draw, target, parameter, column), and what their variance says.
 
-    `unit` is that of the root of the largest variance; `what` describes it. `inverse`: its reciprocal is given, in
-    standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair
-    to those of the candidates; targets are then one after the other for the pairs of each draw.
+    `unit` is the unit of the root of the largest variance; `what` describes it. With `inverse` its reciprocal is given,
+    in standard deviations. `blocks` (pair, parameter, own) lead from the parameters of each pair to the parameters of
+    the candidates; targets then stand one after the other for the pairs of each draw. The criterion `worst`, for
+    instance, is the largest error of p over the field, in %.
     """
 
     name: str
@@ -208,7 +209,7 @@ def _apart(found: Candidates) -> Criterion:
 
 
 def amplitudes_of(found: Candidates, effects: Iterable[str]) -> dict[str, list[int]]:
-    """The places of the numbers of each effect among the parameters of the candidates."""
+    """The positions of the numbers of each effect among the parameters of the candidates."""
     names = np.array(found.names)
     return {e: np.flatnonzero(np.char.startswith(names, f"{e}.")).tolist() for e in effects}
 
@@ -226,7 +227,9 @@ def stated_size(found: Candidates, effect: str) -> Float[np.ndarray, " f"]:
 def apart(
     found: Candidates, of: Mapping[str, Sequence[int]], size: Mapping[str, Float[np.ndarray, " f"]]
 ) -> Criterion:
-    """The least distance of all pairs of effects, `of` which the numbers are given; those with a `size` may be true."""
+    """The least distance over all pairs of effects; `of` holds the positions of their numbers, effects with a `size`
+    may be true.
+    """
     base = np.setdiff1d(np.arange(len(found.names)), np.concatenate([list(i) for i in of.values()]))
     widest, blocks = max(map(len, of.values())), []
     for truth, rival in itertools.permutations(of, 2):
@@ -244,9 +247,9 @@ def apart(
 
 
 def effects_alike(after: Any, prior: Calibration) -> tuple[Any, ...]:
-    """The effects that a diagnosis could not tell apart: that found, as it is, then its rivals by name.
+    """The effects that a diagnosis could not tell apart: the effect that it found, as it is, then its rivals by name.
 
-    `after` is the diagnosis, or its folder, `prior` its calibration. Raises `DataError` where there are none.
+    `after` is the diagnosis or its folder, `prior` its calibration. Raises `DataError` where there are none.
     """
     diagnosis, path = document(after) if isinstance(after, Diagnosis) else None, None
     if isinstance(after, RunFolder | str | os.PathLike):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,10 @@ from walop_jax.simulation.observing_plan import ObservingPlan
 class PlannedExposure:
     """One line of a plan: settings, number of exposures, the time (s) of all of them, and their gain.
 
-    `number` is that of the Moon patch or star, −1 through the polariser; `place` that of a star in its raster (None:
-    all). `exptime` (s) is of one exposure, `change` (s) the time until the first can begin. `left_out` is the factor by
-    which the criterion grows without this line, `one_more` the one by which it falls with another exposure. `needed`:
-    a go needs an exposure of it, whatever its gain.
+    `number` is the number of the Moon patch or star, −1 through the polariser; `place` the place of a star in its
+    raster (None: all places). `exptime` (s) is the time of one exposure, `change` (s) the time until the first can
+    begin. `left_out` is the factor by which the criterion grows without this line, `one_more` the factor by which it
+    falls with another exposure. `needed`: a go needs an exposure of this line, whatever its gain.
     """
 
     kind: str
@@ -42,15 +42,17 @@ class PlannedExposure:
     place: int | None = None
     needed: bool = False
 
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table of a plan."""
+    def cells(self, reading_in_words: Callable[[str, float], str]) -> tuple[str, ...]:
+        """The row of the table of a plan, with readings as `Instrument.reading_in_words` has them."""
         number = "" if self.number < 0 else f" {self.number}"
-        positions = ", ".join(f"{p} {_angle(a)}" for p, a in self.positions.items())
-        angle = _angle(self.polariser_angle if np.isfinite(self.polariser_angle) else None)
+        readings = (
+            f"{p} {'out' if a is None else reading_in_words(p, a)}" for p, a in self.positions.items()
+        )
+        angle = f"{self.polariser_angle:.1f}°" if np.isfinite(self.polariser_angle) else "out"
         exposures, time = f"{self.times} × {self.exptime:g} s", f"{self.seconds + self.change:.0f}"
         what = f"{self.kind}{number}" + ("" if self.place is None else f" at {self.place}")
         loss = f"{100 * (np.sqrt(self.left_out) - 1):+.2g} %{'; a go needs it' if self.needed else ''}"
-        return (what, self.filter, positions, angle, exposures, time, loss)
+        return (what, self.filter, ", ".join(readings), angle, exposures, time, loss)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -92,17 +94,19 @@ class ExposurePlan(Displayed):
 
     @property
     def efficiency(self) -> float:
-        """Share of the time in which the best plan of any exposures would be as good, but for prior knowledge."""
+        """Fraction of the time in which the best plan of any exposures would be as good, but for prior knowledge."""
         return self.criterion.variance(self.bound) / self.criterion.variance(self.value)
 
     @property
     def gap(self) -> float:
-        """Proven relative distance of the exposures' variance from the best: that of the criterion of `optimal`."""
+        """Proven relative distance of the variance of the exposures from the best: distance in the criterion of
+        `optimal`.
+        """
         return self.criterion.variance(self.value) / self.criterion.variance(self.bound) - 1.0
 
     @property
     def share(self) -> float | None:
-        """Share of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
+        """Fraction of the field points and colours, of those that hold u, at which the error of p is below 0.1 %."""
         errors = self.after[:, np.isfinite(self.after).all(axis=0)]
         return float(np.mean(errors < GOAL)) if errors.size else None
 
@@ -179,10 +183,6 @@ class ExposurePlan(Displayed):
             title=f"No go with {alone}: {'; '.join(self.lacks)}" if self.lacks else f"Plan of {exposures}",
             facts=tuple(facts.items()),
             head=("KIND", "FILTER", "POSITIONS", ">POLARISER", ">EXPOSURES", ">TIME / s", ">LOSS IF OMITTED"),
-            rows=tuple(line.cells() for line in self.lines),
+            rows=tuple(line.cells(self.observing_plan.design.reading_in_words) for line in self.lines),
             notes=self.notes,
         )
-
-
-def _angle(angle: float | None) -> str:
-    return "out" if angle is None else f"{angle:.1f}°"

@@ -26,12 +26,12 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.flux import FluxGroups, project_flux
 from walop_jax.likelihood.inverses import of_low_rank, pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, prior_rows
 from walop_jax.likelihood.noise import NoiseTerms, factors
 from walop_jax.model import light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.compiled import compiled
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, Effect, EffectKind, effect_by_name
@@ -55,7 +55,7 @@ GRID = 7
 DRAWS = 20
 NOT_CHOSEN = {condition: column for condition, column in CONDITIONS.items() if condition != "exptime"}
 """Conditions of an exposure that are as they come, and their columns."""
-Counts = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
+CountsAndSlopes = tuple[Float[np.ndarray, "p e k"], Float[np.ndarray, "p e k f"]]
 """Counts of light of unit flux, and their derivatives to the free parameters."""
 _AT_ONCE = 36  # field points: arrays stay small
 _ROUNDING = 1e-10  # of the largest eigenvalue
@@ -66,10 +66,11 @@ class Candidates:
     """Everything that could be observed, with the information that each exposure would bring.
 
     `families` go with `choices`, their information scaled to the field points of the plan. `values` (draw, parameter)
-    are all parameters of the instruments that were drawn, `prior` the information on the free ones beforehand, `names`
-    of these. `truncation` is the highest harmonic of the counts in the angle of the polariser beside their mean: none
-    where the angles at which they were computed are enough. `notes` say what had to be left out. `effects` are those
-    that are to be separated, parameters of the model as well, with whether their size is known.
+    are all parameters of the instruments that were drawn, `prior` is the information on the free parameters beforehand,
+    `names` are the names of these. `truncation` is the highest harmonic of the counts in the angle of the polariser
+    beside their mean: nothing if the angles at which they were computed are enough. `notes` say what had to be left
+    out. `effects` are the effects that are to be separated, which are parameters of the model as well, each with
+    whether its size is known.
     """
 
     available: Available
@@ -123,8 +124,8 @@ def candidates(
             values[:, i] = p.start
     likelihood = Likelihood.of(calset, model)
     flux, exptime = simulation.fluxes(plan, None), plan.exposures().exptime
-    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.floor
-    shared = Sharing(model.template.cameras.together)
+    noise, floor = simulation.PhotonNoise(plan.read_noise), model.template.cameras.noise_floor
+    shared = FluxGroups(model.template.cameras.together)
     of_mean = {f"standard.{plan.star_names[-1]}.{axis}" for axis in "qu"} if plan.zero_stars else set()
     means = [place for place, i in enumerate(model.free) if model.names[i] in of_mean]
     responses = []
@@ -132,7 +133,7 @@ def candidates(
         tell(f"expected counts of instrument {number} of {draws}")
         responses.append(_responses(likelihood, draw))
 
-    def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[Counts, ...]]:
+    def seen(choice: CandidateExposure, rows: slice) -> tuple[Illumination, tuple[CountsAndSlopes, ...]]:
         """The light of some exposures of a choice, and their counts in every draw."""
         at = likelihood.used[:, rows.start]
         electrons = flux[at, rows.start] * choice.seconds / exptime[rows.start]
@@ -144,7 +145,7 @@ def candidates(
 
     families: list[Family] = []
     for choice, start, stop in zip(choices, first[:-1], first[1:], strict=True):
-        tell(f"information of {choice.text()}")
+        tell(f"information of {choice.in_words(plan.design.reading_in_words)}")
         cost = choice.seconds + available.costs.of(choice.kind)
         if choice.kind == "clp":
             lit, counts = seen(choice, slice(start, stop))
@@ -166,7 +167,7 @@ def candidates(
 def with_members(
     model: Model, calset: CalibrationSet, given: Sequence[str | Effect]
 ) -> tuple[Model, dict[str, bool]]:
-    """The model with effects at their values, and which of them have one."""
+    """The model with effects at their values, and for each effect whether it has a value."""
     context, stated, extended = effect_context(model.template, calset.exposures), {}, model
     for item in given:
         effect = item
@@ -194,7 +195,7 @@ def with_members(
 
 
 def fewer_points(plan: ObservingPlan) -> tuple[ObservingPlan, Float[np.ndarray, " p"]]:
-    """The same over fewer field points, and for how many of the plan each of them stands; those of stars stay.
+    """The plan over fewer field points, and for how many points of the plan each of them stands; points of stars stay.
 
     Along each axis polynomials of a degree below the number of points have the same sum over both.
     """
@@ -225,7 +226,7 @@ def drawn(model: Model, draws: int, seed: int, around: Calibration | None) -> Fl
 _unit_at = compiled(jax.vmap(engine.unit_slopes, (None, None, 0)), kept_as="unit_counts")
 
 
-def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> Counts:
+def _responses(likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> CountsAndSlopes:
     """Counts for light of unit flux, and their derivatives to the free parameters."""
     instrument, select = likelihood.model.instrument(values), likelihood.model.selection()
     batches = [_unit_at(instrument, likelihood.plan, batch) for batch in likelihood.points]
@@ -269,18 +270,18 @@ def errors_of(
 
 
 class Illumination(NamedTuple):
-    """Light of an exposure: `flux` (electron) at its points, noise, what shares a flux.
+    """Light of an exposure at the points of a plan: `flux` (electron, p), noise, and the cameras that share a flux.
 
-    No error is smaller than `floor`, a share of the mean counts of all cameras, as in a fit (`Cameras.floor`). `weight`
-    is for how many points of the plan each of them stands. `scatter` is the rms of single stars around a parameter, by
-    its place; each exposure counts as one of other stars. `errors` are s² and f² of the cameras in
-    σ² = s² N_ERR² + f² N².
+    No error is smaller than the fraction `floor` of the mean counts of all cameras, as in a fit
+    (`Cameras.noise_floor`). `weight` (p) is the number of points of the plan that each point stands for. `scatter` is
+    the rms of single stars around a parameter, by the position of that parameter; each exposure counts as one of other
+    stars. `errors` are s² and f² of the cameras in σ² = s² N_ERR² + f² N².
     """
 
     flux: Float[np.ndarray, " p"]
     noise: simulation.PhotonNoise
     floor: float
-    shared: Sharing
+    shared: FluxGroups
     weight: Float[np.ndarray, " p"]
     scatter: Mapping[int, float] = MappingProxyType({})
     errors: tuple[Float[Any, " *k"], Float[Any, " *k"]] = (np.ones(()), np.zeros(()))
@@ -290,7 +291,7 @@ class Illumination(NamedTuple):
         shape = [1] * counts.ndim
         shape[axis] = -1
         squared, added = (np.reshape(factor, shape) for factor in self.errors)
-        stated = with_floor(self.noise.sigma(counts), counts, self.floor, axis)
+        stated = with_noise_floor(self.noise.sigma(counts), counts, self.floor, axis)
         return np.sqrt(squared * stated**2 + added * counts**2)
 
     def information(
@@ -304,7 +305,7 @@ class Illumination(NamedTuple):
         projected = project_flux(columns, unit * weight, False, self.shared)
         if any(self.scatter.values()):
             stars = np.stack([size * projected[place] for place, size in self.scatter.items()], axis=-1)
-            alone = Sharing(stars=of_low_rank(stars[:, :, None]))
+            alone = FluxGroups(stars=of_low_rank(stars[:, :, None]))
             projected = alone.independent(projected[..., None, :])[..., 0, :]
         projected = projected * np.sqrt(self.weight)[:, None, None]
         flat = projected.transpose(2, 0, 1, 3).reshape(unit.shape[1], len(projected), -1)
@@ -341,14 +342,14 @@ class Polarised(Family):
     """
 
     light: Illumination
-    counts: tuple[Counts, ...]
+    counts: tuple[CountsAndSlopes, ...]
     angles: int
     cost: Float[np.ndarray, " m"]
     kept: dict[int, Float[np.ndarray, "r f f"]] = dataclasses.field(default_factory=dict, compare=False)
 
     @classmethod
     def of(
-        cls, choice: CandidateExposure, light: Illumination, counts: tuple[Counts, ...], cost: float
+        cls, choice: CandidateExposure, light: Illumination, counts: tuple[CountsAndSlopes, ...], cost: float
     ) -> Polarised:
         """The candidates of a choice."""
         return cls(light, counts, len(choice.stops), np.full(len(choice.stops), float(cost)))
@@ -426,7 +427,8 @@ def information_of(
 ) -> Float[np.ndarray, "f f"]:
     """Information of the data of a calibration on parameters by name, beside their priors.
 
-    None on those that it has not, nor on those of `effects` and of the moonlit sky, which is another one next time.
+    It is 0 for parameters that the calibration has not, for parameters of `effects`, and for the moonlit sky, which is
+    another one next time.
     """
     model, without = known.model, {*effects, MoonSky.name}
     shared = [i for i, n in enumerate(names) if n in model.names and model[n].part not in without]

@@ -75,18 +75,22 @@ def _of_the_sky(found: Candidates, planned: Required, had: Sequence[Exposures]) 
 
 
 def _directions(found: Candidates, planned: Required, had: Sequence[Exposures]) -> Required:
-    """One exposure through the polariser in each of so many directions that none are missing."""
-    indoors = {i: choice for i, choice in enumerate(found.choices) if choice.kind == "clp"}
-    if not indoors or found.available.plan.moving or any(e.further for e in had):
+    """Exposures through the polariser in so many directions that a go misses none, one in each."""
+    choices_of_clp = {i: choice for i, choice in enumerate(found.choices) if choice.kind == "clp"}
+    if not choices_of_clp or found.available.plan.moving or any(e.further for e in had):
         return {}  # which element does the work of the polariser is not known here
     angles = [float(angle) for e in had for angle in e.clp_angle[e.clp_in]]
     wanted: dict[tuple[int, int], float] = {}
     for key in sorted(planned, key=lambda key: -planned[key]):
-        angle = indoors[key[0]].stops[key[1]].polariser_angle if key[0] in indoors else None
+        angle = choices_of_clp[key[0]].stops[key[1]].polariser_angle if key[0] in choices_of_clp else None
         if angle is not None and len(_distinct(angles)) < FEW_ANGLES and _is_new(angle, angles):
             angles.append(angle)
             wanted[key] = 1.0
-    plain = indoors[number := min(indoors, key=lambda i: (*_plates(indoors[i]), indoors[i].seconds, i))]
+    plain = choices_of_clp[
+        number := min(
+            choices_of_clp, key=lambda i: (*_plates(choices_of_clp[i]), choices_of_clp[i].seconds, i)
+        )
+    ]
 
     def on_the_grid(angle: float) -> tuple[int, float]:
         stop = plain.number(angle)

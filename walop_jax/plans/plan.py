@@ -62,7 +62,9 @@ USUAL_PLATE = 22.5
 
 
 class Line(NamedTuple):
-    """Exposures of a plan that are the same: number of the choice and in it, how often; half a turn `later`?"""
+    """Equal exposures of a plan: the number of the choice and of the stop in it, how often, and whether half a turn
+    `later`.
+    """
 
     choice: int
     number: int
@@ -159,9 +161,10 @@ def plan_from(
     pairs: Sequence[tuple[str, str]] = (),
     progress: Callable[[str], None] | None = None,
 ) -> ExposurePlan:
-    """As `plan_exposures`, from candidates that are there; `known` is the information of earlier exposures, `had`.
+    """The plan of `plan_exposures`, from candidates that are there; `known` is the information of earlier exposures,
+    `had`.
 
-    With `pairs`, those of the blocks of the criterion, the plan is of one exposure or two that separate all of them.
+    With `pairs`, the names of the blocks of the criterion, the plan is one exposure or two that separate all of them.
     """
     tell = progress or (lambda text: None)
     criteria.check_wishes(minutes, goal)
@@ -326,7 +329,9 @@ def _for_a_go(
 
 
 def _ordered(found: Candidates, planned: Weights) -> list[Line]:
-    """Indoors setting by setting, the polariser turning one way; then the sky, last setting first, the nearest next."""
+    """Light through the polariser first, setting by setting, the polariser turning one way; then the sky, last setting
+    first, the nearest pointing next.
+    """
     later = needs.half_a_turn_later(found, planned)
     lines = [Line(*at, int(times), at in later) for at, times in planned.items()]
     settings = list(dict.fromkeys(found.choices[i].setting for i in sorted({line.choice for line in lines})))
@@ -393,7 +398,7 @@ def largest_variance(experiment: Experiment, total: Float[np.ndarray, "r n n"]) 
 def _described(
     found: Candidates, experiment: Experiment, lines: list[Line], best: Allocation, required: Weights
 ) -> Iterator[PlannedExposure]:
-    without, added = optimal.worth(experiment, best)
+    without, added = optimal.criterion_without_and_with(experiment, best)
     for line, change in zip(lines, _changes(found, lines), strict=True):
         choice, key = found.choices[line.choice], (line.choice, line.number)
         stop = _stop(choice, line)

@@ -21,8 +21,8 @@ from walop_jax.plans.optimal import (
     Key,
     NotEstimableError,
     Some,
-    Weight,
     Weights,
+    WeightVector,
     bounded,
     multipliers,
     tops,
@@ -77,23 +77,23 @@ class _Whole:
         self.weight = np.array([plan.weights.get(key, 0.0) for key in self.some.keys])
         self.least = np.array([required.get(key, 0.0) for key in self.some.keys])
 
-    def weights(self, count: Weight) -> dict[Key, float]:
+    def weights(self, count: WeightVector) -> dict[Key, float]:
         """The candidates in a plan."""
         return {self.some.keys[i]: float(count[i]) for i in np.flatnonzero(count)}
 
-    def value(self, count: Weight) -> float:
+    def value(self, count: WeightVector) -> float:
         """The criterion of a plan."""
         return self.some.value(count)
 
-    def cost(self, count: Weight) -> float:
+    def cost(self, count: WeightVector) -> float:
         """What a plan costs, changes and all."""
         return self.time(self.weights(count))
 
-    def fits(self, count: Weight) -> bool:
+    def fits(self, count: WeightVector) -> bool:
         """Whether the budget pays for a plan."""
         return self.cost(count) <= self.problem.budget * (1 + 1e-9)
 
-    def first(self) -> Weight:
+    def first(self) -> WeightVector:
         """Weights rounded down, beside what is required, so far as the budget pays for both."""
         for scale in np.linspace(1.0, 0.0, 41):
             count = self.least + np.floor(scale * self.weight + 1e-9)
@@ -104,7 +104,7 @@ class _Whole:
             f"the budget, {self.problem.budget:g}, is less than what is required costs: {least:g}"
         )
 
-    def starts(self, setting: Callable[[Key], Hashable] | None) -> Iterator[Weight]:
+    def starts(self, setting: Callable[[Key], Hashable] | None) -> Iterator[WeightVector]:
         """Plans to begin with: of all candidates with weight, and of the settings that have most of it."""
         yield self.filled(self.first())
         if setting is None:
@@ -120,7 +120,7 @@ class _Whole:
             with contextlib.suppress(ValueError):  # what is required may be all that the budget pays for
                 yield self.filled(self.least, others)
 
-    def filled(self, count: Weight, forbidden: Collection[Key] = ()) -> Weight:
+    def filled(self, count: WeightVector, forbidden: Collection[Key] = ()) -> WeightVector:
         """A plan with the remaining budget spent, one candidate at a time."""
         units = np.eye(len(self.some.keys))
         while True:
@@ -148,7 +148,7 @@ class _Whole:
             )
         return count
 
-    def without(self, count: Weight, forbidden: set[Key]) -> Weight:
+    def without(self, count: WeightVector, forbidden: set[Key]) -> WeightVector:
         """The same without some candidates, but for those required, and the time that they took spent on others."""
         among = np.array([key in forbidden for key in self.some.keys])
         count = np.where(among, self.least, count)
@@ -156,7 +156,7 @@ class _Whole:
             self.filled(count, forbidden) if count.any() else np.where(among, self.least, self.weight * 0.0)
         )
 
-    def exchanged(self, count: Weight) -> Float[np.ndarray, " _"]:
+    def exchanged(self, count: WeightVector) -> Float[np.ndarray, " _"]:
         """A plan that no exchange of one candidate for another of those tried makes better."""
         for _ in range(_EXCHANGES):
             count, better = self._exchange(count)
@@ -165,7 +165,7 @@ class _Whole:
             count = self.filled(count)
         return count
 
-    def _exchange(self, count: Weight) -> tuple[Float[np.ndarray, " _"], bool]:
+    def _exchange(self, count: WeightVector) -> tuple[Float[np.ndarray, " _"], bool]:
         """One exchange that lowers the criterion, if there is one: the most promising by their slopes are tried."""
         # The worst targets, smoothly: the slope of the maximum alone would forget the next one.
         shares = multipliers(self.some, count, _SHARPNESS)

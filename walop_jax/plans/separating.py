@@ -45,10 +45,10 @@ DECIDED = thresholds.SEPARATION**2
 """Δχ² from which a rival is excluded."""
 STEPS = 4  # of the grid of the polariser, from one angle that is tried at first to the next
 _FIRSTS = 4  # exposures that are tried as the first of two
-_PROMISING = 8  # pairs that are tried in several shares of the time
+_PROMISING = 8  # pairs that are tried in several fractions of the time
 _SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)  # of the time for the first of two exposures
 _WORTH = 1.02  # times the least Δχ² of one exposure that a second one has to bring
-_INFORMED = 1e-12  # share of the largest eigenvalue from which a direction is informed
+_INFORMED = 1e-12  # fraction of the largest eigenvalue from which a direction is informed
 
 Information = Float[np.ndarray, "f f"]
 
@@ -62,7 +62,7 @@ class Pair(NamedTuple):
     after: float
 
     def in_words(self) -> str:
-        """One sentence."""
+        """A sentence on how well the pair is separated."""
         excluded = "excluded" if self.after >= DECIDED else "not excluded"
         return f"if {self.truth} is true, {self.rival} is {excluded}: Δχ² {self.after:.3g} (now {self.before:.2g})"
 
@@ -192,7 +192,7 @@ def few_exposures(
     problem = experiment.reduced()
 
     def repeated(shares: Mapping[Key, float]) -> dict[Key, float]:
-        """As many exposures as the budget pays for, in these shares of it; none where one of them has no place."""
+        """As many exposures as the budget pays for, in these fractions of it; none where one of them has no place."""
         for scale in np.linspace(1.0, 0.0, 101)[:-1]:
             plan = {
                 (f, i): float(np.floor(scale * share * problem.budget / problem.families[f].cost[i] + 1e-9))

@@ -25,15 +25,15 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import fail
 from walop_jax.model.specification import Model
 from walop_jax.posterior.result import Convergence, Options, PosteriorSample
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 from walop_jax.posterior.target import Target, choose_sampled
 
 ENSEMBLES = 2  # the draws are shared out between, since files have chains
 FEWEST = 0.99
 """Fraction of the fits that have to converge."""
 DRAWS_PER_PARAMETER = 5
-"""Draws for each free parameter from which on their covariance takes the place of that of the fit; of fewer than one
-it would be singular."""
+"""Draws for each free parameter from which on the covariance of the draws replaces the covariance of the fit; with
+fewer than one draw it would be singular."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Bootstrap(Sampler):
     name: ClassVar[str] = "bootstrap"
     repeats_the_fit: ClassVar[bool] = True
 
-    def start(self, density: Density, seed: Sequence[int]) -> State:
-        """Raise TypeError: there is no density that it draws from."""
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
+        """Raise TypeError: this sampler draws from no density."""
         self._without_chains()
 
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
-        """Raise TypeError."""
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
+        """Raise TypeError: this sampler has no chains."""
         self._without_chains()
 
     def _without_chains(self) -> NoReturn:
@@ -58,7 +58,7 @@ class Bootstrap(Sampler):
 
 
 def simulated_like(result: FitResult, rng: np.random.Generator) -> CalibrationSet:
-    """A set with the rows of that of a fit, whose counts scatter about the model as their errors say.
+    """A set like that of a fit, whose counts scatter about the model as their errors say.
 
     Raises `DataError` for intensities that are no table.
     """

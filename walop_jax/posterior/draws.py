@@ -86,11 +86,11 @@ def read_groups(path: str | os.PathLike[str]) -> DataTree:
 
 
 def read_draws(path: Any, names: tuple[str, ...], fit: str | None = None) -> Float[np.ndarray, "d n"]:
-    """Draws of the parameters `names`, all chains one after the other; fixed ones keep their value.
+    """Draws (d, n) of the parameters `names`, all chains one after the other; fixed parameters keep their value.
 
-    `path` is that of a `posterior.nc`, or a posterior in memory.
-    `fit` is the `digest_of_fit` that was sampled around; None: whichever. Raises `DataError` for a file that cannot be
-    read, is of another model or another fit, or may not be trusted.
+    `path` is the path of a `posterior.nc`, or a posterior in memory. `fit` is the `digest_of_fit` of the fit that was
+    sampled around; None: any fit. Raises `DataError` for a file that cannot be read, is of another model or another
+    fit, or may not be trusted.
     """
     if isinstance(path, str | os.PathLike):
         groups = read_groups(path)

@@ -21,10 +21,10 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 
 MOVES = ("laplace", "de", "stretch")
-JUMPS = 0.1  # share of γ = 1 among differential evolution
+JUMPS = 0.1  # fraction of γ = 1 among differential evolution
 WIDER = 1.1  # than the Laplace approximation: its draws as proposals
 LEAST_WALKERS = 64  # unless a number is asked for
 
@@ -44,7 +44,7 @@ class Emcee(Sampler):
     def __post_init__(self) -> None:
         mixture(self.moves)
 
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """Walkers drawn from the Laplace approximation, which is the unit normal in the sampled coordinates."""
         d = density.dimension
         count = self.walkers or max(LEAST_WALKERS, 2 * d)
@@ -58,7 +58,7 @@ class Emcee(Sampler):
             raise ValueError("the posterior is not finite around the fit")
         return {"positions": positions, "log_density": value, "random": random.get_state(legacy=True)}
 
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Go on for that many steps of all walkers."""
         import emcee
 
@@ -84,7 +84,7 @@ def _laplace_draws(
 
 
 def mixture(moves: str) -> list[tuple[Any, float]]:
-    """Return emcee's moves with their shares; ValueError for an unknown name."""
+    """Return emcee's moves with their fractions; ValueError for an unknown name."""
     from emcee import moves as made
 
     if moves not in MOVES:

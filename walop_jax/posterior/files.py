@@ -21,7 +21,7 @@ import numpy as np
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
 from walop_jax.posterior.result import PosteriorSample
-from walop_jax.posterior.samplers import State, Stretch
+from walop_jax.posterior.samplers import EnsembleState, Stretch
 
 CHAIN = "chain.h5"
 _ADVICE = "sample into another folder, or start anew with --overwrite"
@@ -63,8 +63,8 @@ class Chain:
     def __init__(self, folder: str | os.PathLike[str], fingerprint: Mapping[str, str]) -> None:
         self.path, self.fingerprint = Path(folder) / CHAIN, dict(fingerprint)
 
-    def save(self, states: Sequence[State], stretches: Sequence[Stretch], seconds: float) -> None:
-        """Write all ensembles with their states at the end, in place of the former ones."""
+    def save(self, states: Sequence[EnsembleState], stretches: Sequence[Stretch], seconds: float) -> None:
+        """Write all ensembles, each with its state at the end, in place of what the file held."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
         def fill(file: h5py.File) -> None:
@@ -80,7 +80,7 @@ class Chain:
 
         _write_hdf5(self.path, fill, overwrite=True)
 
-    def load(self) -> tuple[list[State], list[Stretch], float]:
+    def load(self) -> tuple[list[EnsembleState], list[Stretch], float]:
         """All ensembles, their states at the end, and seconds; `DataError` for a file of another sample."""
         from emcee.backends import HDFBackend
 
@@ -93,7 +93,7 @@ class Chain:
             # Of the proposals accepted the file has the mean of each walker.
             shares = (np.repeat(k.accepted[None] / k.iteration, k.iteration, axis=0) for k in arrays)
             stretches = [Stretch(k.get_chain(), k.get_log_prob(), next(shares)) for k in arrays]
-            states: list[State] = [
+            states: list[EnsembleState] = [
                 {
                     "positions": s.positions[-1],
                     "log_density": s.log_density[-1],

@@ -24,7 +24,7 @@ from jaxtyping import Array
 
 from walop_jax.io.errors import fail
 from walop_jax.model.compiled import compiled
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 
 TARGET_ACCEPTANCE = 0.8
 DOUBLINGS = 3
@@ -33,7 +33,9 @@ FIRST_STEP = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class Nuts(Sampler):
-    """`warm_up` is the number of steps that settle the step size; they are not part of the chain."""
+    """The no-U-turn sampler; `warm_up` is the number of steps that settle the step size, which are not part of the
+    chain.
+    """
 
     warm_up: int = 200
 
@@ -45,7 +47,7 @@ class Nuts(Sampler):
         if importlib.util.find_spec("blackjax") is None:
             raise fail("nuts needs blackjax", advice="pip install 'walop-jax[nuts]'")
 
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """One walker from a draw of the Laplace approximation, after the warm-up."""
         first = np.random.default_rng(seed).standard_normal(density.dimension)
         key = np.random.SeedSequence(seed).generate_state(1)
@@ -60,7 +62,7 @@ class Nuts(Sampler):
         size = np.array(settled(tuning[0]) if self.warm_up else FIRST_STEP)
         return {"position": first, "key": key, "step_size": size, "steps": np.array(self.warm_up)}
 
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Go on for that many trajectories."""
         positions, values = np.empty((steps, 1, density.dimension)), np.empty((steps, 1))
         acceptance, divergences, gradients = np.empty((steps, 1)), 0, 0

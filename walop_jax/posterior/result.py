@@ -28,6 +28,7 @@ from walop_jax.fit.verdict import STATED, Doubt, Quality, Verdict
 from walop_jax.io.code import versions_of
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import Vector
 from walop_jax.io.text import value_and_error
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.posterior.draws import as_arviz, group_of_draws
@@ -49,10 +50,11 @@ RANKED = 100_000  # positions per quantity that R-hat looks at: sorting more tak
 
 @dataclasses.dataclass(frozen=True)
 class Convergence:
-    """The evidence. `tau` is in steps, per quantity; `history` holds the worst τ after N/4, N/2 and N steps.
+    """Whether chains have converged, and the numbers that say so.
 
-    `steps` are those kept after burn-in, `needed` how many more the rules ask for (0 when converged). Draws that are
-    `independent` by their making have no chain that the rules could judge.
+    `tau` (k) are the autocorrelation times in steps, `history` the worst of them after N/4, N/2 and N steps. `steps` is
+    the number of steps kept after burn-in, `needed` how many more the rules ask for (0 when converged). Draws that are
+    `independent` by their making have no chain to judge.
     """
 
     names: tuple[str, ...]
@@ -76,7 +78,7 @@ class Convergence:
         return self.names[int(np.argmax(self.tau))]
 
     def message(self, seconds_per_step: float = math.nan) -> str:
-        """One sentence for people."""
+        """The result in one sentence."""
         if self.independent:
             drawn = f"{self.ess.min():.0f} independent draws"
             return drawn if self.converged else f"NOT sufficient: {drawn}; {'; '.join(self.reasons)}"
@@ -190,24 +192,24 @@ def assess(chains: Chains, names: tuple[str, ...], thin: int = 1) -> Convergence
     return Convergence(names, steps, tau, history, ess, rhat, needed, tuple(reasons))
 
 
-Vector = Float[np.ndarray, " n"]
-Column = tuple[np.ndarray, str, str]  # values, unit, description
+DescribedColumn = tuple[np.ndarray, str, str]  # values, unit, description
 
-BURN_IN = 0.2  # share of the steps that is not used
+BURN_IN = 0.2  # fraction of the steps that is not used
 LEVELS = {"68": (0.1587, 0.8413), "95": (0.0228, 0.9772)}
 """Quantiles of the intervals: ± 1 and ± 2 standard deviations of a normal distribution."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of `sample`. `interval` is the length of a block, which a killed run can lose, in steps; whole blocks
-    are done, so that there are never more steps than `maximum_steps`.
+    """Options of `sample`.
 
-    `sampler` is a name (`emcee`, `nuts`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are options of emcee,
-    `walkers` 0 standing for twice the number of sampled coefficients, at least 64. `parameters` are the names of those
-    sampled (None: the physics coefficients); samplers of the exact posterior sample all and show these in figures.
-    Every `thin`-th step is stored (0: as is usual for the sampler). `checks` is the number of draws compared with the
-    exact posterior. Raises ValueError for what makes no sense.
+    `sampler` is a name (`emcee`, `nuts`, `bootstrap`), `FILE.py:CLASS`, or a `Sampler`; `walkers` and `moves` are
+    options of emcee, where `walkers` 0 stands for twice the number of sampled coefficients, at least 64. `interval` is
+    the length of a block in steps: a killed run loses at most one block; only whole blocks are done, so that there are
+    never more steps than `maximum_steps`. `parameters` are the names of the sampled coefficients (None: the physics
+    coefficients); samplers of the exact posterior sample all, and figures show these. Every `thin`-th step is stored
+    (0: as is usual for the sampler). `checks` is the number of draws compared with the exact posterior. Raises
+    ValueError for values that make no sense.
 
     >>> walop.Options(walkers=128).sampler
     'emcee'
@@ -249,7 +251,7 @@ class Options:
 
 
 class Progress(NamedTuple):
-    """Contents of a progress bar: the stage, the share of it that is done (0 … 1), τ in steps, effective samples."""
+    """Contents of a progress bar: the stage, the fraction of it that is done (0 … 1), τ in steps, effective samples."""
 
     stage: str
     share: float
@@ -264,16 +266,16 @@ Report = Callable[[Progress], None]
 class PosteriorSample(Drawn):
     """The posterior of all coefficients.
 
-    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and frozen ones
-    included; `mean` and `covariance` use every kept step. `chains` are of the coefficients `sampled`, those that
-    figures show. `accuracy` is that of the surrogate, None where the exact posterior was sampled; `trusted` needs
-    convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from` says
-    what their spread was made from: the stated errors of the data or, as for the fit, its residuals
-    (`sandwich_adjusted`). `counts` are those of the sampler, `fit` is the `digest_of_fit` of the fit sampled around,
-    `likelihood` that of its data, whose errors were taken times `noise_scale`.
+    `draws` holds (ensemble, draw, parameter) of all parameters in tree order, tied and fixed ones included; `mean` and
+    `covariance` use every kept step. `chains` are the chains of the coefficients `sampled`, which figures show.
+    `accuracy` compares the surrogate with the exact posterior; None where the exact posterior was sampled. `trusted`
+    needs convergence, a surrogate that is exact enough, and a fit that is trusted (`of_trusted_fit`). `errors_from`
+    says what the spread of the draws was made from: the stated errors of the data or, as for the fit, its residuals
+    (`sandwich_adjusted`). `counts` are numbers that the sampler reports, `fit` is the `digest_of_fit` of the fit
+    sampled around, `likelihood` the likelihood of its data, whose errors were taken times `noise_scale`.
     """
 
-    first_figure = "corner"
+    _first_figure = "corner"
 
     sampler: str
     names: tuple[str, ...]
@@ -309,7 +311,7 @@ class PosteriorSample(Drawn):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict: it is no go where the chains, or the fit that they are around, are not to be trusted."""
+        """The verdict: no go if the chains, or the fit that they are around, are not to be trusted."""
         again = "walop-jax sample RUN --resume goes on, or take fewer coefficients"
         of_fit = "walop-jax diagnose looks for what the fit lacks"
         bad = [] if self.trusted else self.warnings
@@ -319,7 +321,7 @@ class PosteriorSample(Drawn):
         ]
         remarks = (Doubt(Quality(0), text, blocking=False) for text in self.warnings if self.trusted)
         stars = "that of the fit, with this covariance: walop-jax check RUN" if self.trusted else ""
-        return Verdict(against=(*doubts, *remarks), subject="Posterior", stars=stars)
+        return Verdict(doubts=(*doubts, *remarks), subject="Posterior", stars=stars)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -351,7 +353,7 @@ class PosteriorSample(Drawn):
 
     @property
     def varying(self) -> list[int]:
-        """Positions of the coefficients that vary; tied ones do, frozen ones do not."""
+        """Positions of the coefficients that vary; tied ones do, fixed ones do not."""
         return [i for i in range(len(self.names)) if np.ptp(self.draws[:, :, i]) > 0]
 
     @property
@@ -364,7 +366,7 @@ class PosteriorSample(Drawn):
         i = self.names.index(name)
         return float(self.mean[i]), float(np.sqrt(self.covariance[i, i]))
 
-    def intervals(self) -> dict[str, Column]:
+    def intervals(self) -> dict[str, DescribedColumn]:
         """Median, 68 and 95 % intervals of every coefficient that varies, as columns with unit and description.
 
         τ, effective samples and R-hat are NaN for coefficients that are not sampled but drawn from their conditional
@@ -374,7 +376,7 @@ class PosteriorSample(Drawn):
         values = self.draws.reshape(-1, len(self.names))[:, varies]
         names, units = [self.names[i] for i in varies], [self.units[i] for i in varies]
         deviation = np.sqrt(np.diag(self.covariance))[varies]
-        columns: dict[str, Column] = {
+        columns: dict[str, DescribedColumn] = {
             "NAME": (np.array(names), "", "coefficient"),
             "UNIT": (np.array(units), "", "unit of the numbers in this row"),
             "MEDIAN": (np.median(values, axis=0), "", "posterior median"),
@@ -414,7 +416,7 @@ class PosteriorSample(Drawn):
         if likelihood.plan.exposures.shared is not None:
             what = "exposures share their flux (KIND steady)"
             raise ValueError(f"{what}: their rows cannot be left out one by one")
-        if not likelihood.sharing.single:
+        if not likelihood.flux_groups.single:
             what = "exposures share q and u of the stars of a field (SCATTER of SOURCES)"
             raise ValueError(f"{what}: their rows cannot be left out one by one")
         used, per_row = likelihood.used, np.broadcast_to(likelihood.data_per_row, likelihood.used.shape)

@@ -11,25 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from walop_jax.calibration.calibration import Calibration, Matrix
+from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.product import read_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.clipped import read_clipped
 from walop_jax.data.records import CalibrationSet
 from walop_jax.fit.model_of_set import model_for
 from walop_jax.fit.parameter_table import Fitted
-from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import STATED
 from walop_jax.io.display import Display
 from walop_jax.io.errors import errors_naming, fail
 from walop_jax.io.names import CLIPPED, MODEL, POSTERIOR, PRODUCT, SUMMARY
 from walop_jax.io.run_folder import RunFolder
+from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.io.text import per_cent
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import EFFECTS, Deviations, EffectKind
 from walop_jax.model.effects.in_models import model_without
-from walop_jax.model.specification import Model, Vector
+from walop_jax.model.specification import Model
 from walop_jax.posterior.draws import A_MEAN, read_groups
 
 SAME_FIT = 0.05  # standard errors
@@ -37,12 +38,11 @@ SAME_FIT = 0.05  # standard errors
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The folder of a run; files are read when they are needed. None stands for files that are missing.
+    """The folder of a run; files are read when they are needed, and a missing file is None.
 
     `catalogue` are the effects that its model may have, `data` the sets of its fit (default: where they were, in the
-    folder of the run, or beside it).
-
-    Values, covariance, names and `to_table()` are those of its calibration, as of a fit; `posterior` are the draws.
+    folder of the run, or beside it). Values, covariance, names and `to_table()` are taken from its calibration, as of a
+    fit; `posterior` are the draws.
 
     >>> walop.read("RUN")["pupil.magnification"]
     15.6675 ± 0.0051
@@ -80,7 +80,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
 
     @property
     def trusted(self) -> bool:
-        """The verdict on the calibration."""
+        """True if its calibration is to be trusted."""
         return self.required_calibration.verdict.trusted
 
     @functools.cached_property
@@ -152,7 +152,7 @@ class Run(RunFolder, Fitted):  # pyright: ignore[reportIncompatibleVariableOverr
             what = f"{model.names[int(np.argmax(away))]} moves by {np.max(away):.2g} standard errors"
             raise fail(f"fitted again, {what}", file=self.folder, advice=advice)
         if calibration.verdict.errors_from != STATED:
-            result = with_honest_errors(result)
+            result = with_empirical_covariance(result)
         verdict = calibration.verdict
         if result.errors_from != verdict.errors_from and verdict.covariance_from == "fit":
             errors = {

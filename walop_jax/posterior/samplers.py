@@ -33,7 +33,7 @@ SAMPLERS = {
 Positions = Float[np.ndarray, "n k"]
 Batch = Callable[[Positions], Float[np.ndarray, " n"]]
 
-State = Mapping[str, Any]  # all there is to an ensemble between two steps, by name
+EnsembleState = Mapping[str, Any]  # all there is to an ensemble between two steps, by name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Density:
 
 
 class Stretch(NamedTuple):
-    """Result of a number of steps: positions, their ln p, and the share of proposals accepted.
+    """Result of a number of steps: positions, their ln p, and the fraction of proposals accepted.
 
     `counts` are numbers that the sampler wants to be reported, summed over all stretches.
     """
@@ -83,13 +83,13 @@ class Stretch(NamedTuple):
 
 
 class Sampler(abc.ABC):
-    """A way of drawing from a density.
+    """A way of drawing from a density; `Emcee` is one.
 
-    Without `exact` it is given the surrogate, in which throughput coefficients and catalogue values are marginalised;
-    with it the exact posterior of all free parameters. `software` are the packages whose versions its draws depend on;
-    of its steps every `thin`-th is stored, unless something else is asked for. The chains of emcee are kept, so that an
-    interrupted run `resumes`; those of others start anew. One that `repeats_the_fit` on simulated sets has no density
-    and no chains (`posterior.bootstrap`).
+    A sampler that is not `exact` is given the surrogate, in which throughput coefficients and catalogue values are
+    marginalised; an `exact` one the posterior of all free parameters. `software` are the packages whose versions its
+    draws depend on; every `thin`-th of its steps is stored, unless something else is asked for. A sampler that
+    `resumes` goes on with the chain of an interrupted run; others start anew. One that `repeats_the_fit` on simulated
+    sets has no density and no chains (`posterior.bootstrap`).
 
     The same state and number of steps must always give the same stretch, whatever has been computed before: random
     numbers come from the state.
@@ -103,11 +103,11 @@ class Sampler(abc.ABC):
     repeats_the_fit: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def start(self, density: Density, seed: Sequence[int]) -> State:
+    def start(self, density: Density, seed: Sequence[int]) -> EnsembleState:
         """Return an ensemble before its first step; `seed` as `numpy.random.default_rng` takes it."""
 
     @abc.abstractmethod
-    def advance(self, density: Density, state: State, steps: int) -> tuple[State, Stretch]:
+    def advance(self, density: Density, state: EnsembleState, steps: int) -> tuple[EnsembleState, Stretch]:
         """Return the ensemble after `steps` more steps, and their results."""
 
 

@@ -24,14 +24,13 @@ from walop_jax.model.specification import Model
 from walop_jax.posterior import result as results
 from walop_jax.posterior.draws import A_MEAN, digest, digest_of_fit
 from walop_jax.posterior.files import Chain
-from walop_jax.posterior.result import Chains, Convergence, Options, PosteriorSample, Progress
-from walop_jax.posterior.samplers import Density, Sampler, State, Stretch
+from walop_jax.posterior.result import Chains, Convergence, Options, PosteriorSample, Progress, Report
+from walop_jax.posterior.samplers import Density, EnsembleState, Sampler, Stretch
 from walop_jax.posterior.surrogate import Surrogate, build_surrogate, compare_with_exact
 from walop_jax.posterior.target import ExactPosterior, Target, choose_sampled
 
 Monitored = Callable[[Chains], Chains]
 Covariance = Float[np.ndarray, "n n"]
-Report = Callable[[Progress], None] | None
 
 SOFTWARE = ("walop-jax", "jax", "jaxlib", "numpy")
 OF_LENGTH, OF_SAMPLER = ("maximum_steps", "draws", "checks"), ("sampler", "walkers", "moves")
@@ -52,7 +51,7 @@ class Ensembles:
         else:
             began = time.perf_counter()
             seeds = [(options.seed, number) for number in range(options.ensembles)]
-            self.states: list[State] = [dict(sampler.start(density, seed)) for seed in seeds]
+            self.states: list[EnsembleState] = [dict(sampler.start(density, seed)) for seed in seeds]
             self.seconds = time.perf_counter() - began
 
     @property
@@ -62,7 +61,7 @@ class Ensembles:
 
     @property
     def acceptance(self) -> float:
-        """Share of proposals accepted in the steps that are stored."""
+        """Fraction of proposals accepted in the steps that are stored."""
         return float(np.mean([stretch.acceptance for stretch in self.stretches]))
 
     @property
@@ -84,7 +83,7 @@ class Ensembles:
         return dict(total)
 
     def go_on(self) -> None:
-        """One more block."""
+        """Compute one more block of steps."""
         began, interval = time.perf_counter(), self.options.interval
         advanced = [self.sampler.advance(self.density, state, interval) for state in self.states]
         stretches = [self._stored(stretch) for _, stretch in advanced]
@@ -113,7 +112,7 @@ class Ensembles:
         return z[:, first:], lnp[:, first:]
 
     def until_converged(
-        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report = None
+        self, names: Sequence[str], monitored: Monitored = np.asarray, report: Report | None = None
     ) -> Convergence:
         """Go on until the rules of convergence hold or another block would exceed `maximum_steps`; returns the verdict.
 
@@ -177,7 +176,7 @@ def sample(
     *,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
-    report: Report = None,
+    report: Report | None = None,
 ) -> PosteriorSample:
     """Sample the posterior around a fit until it has converged or `maximum_steps` are done.
 

@@ -39,10 +39,9 @@ from jaxtyping import Array, Float, Int
 from walop_jax.model.compiled import compiled
 from walop_jax.model.noise import COMMON
 from walop_jax.posterior.samplers import Density
-from walop_jax.posterior.target import Target, choose_sampled, ln_scale_unit
+from walop_jax.posterior.target import Draws, Target, choose_sampled, ln_scale_unit
 
-Matrix = Float[np.ndarray, "..."]
-Draws = Float[np.ndarray, "n k"]
+Stacked = Float[np.ndarray, "..."]
 
 OVERSAMPLING = 1.5  # design points per feature
 LEAST = 1.1  # pairs of points ±u per odd feature, and per even feature: a pair measures one of each
@@ -52,14 +51,13 @@ BENT = 8  # directions that get cubic terms
 
 @dataclasses.dataclass(frozen=True)
 class Surrogate:
-    """Everything needed to evaluate and to draw.
-
-    `scale` is the fitted value of a common scale of the errors, whose ln f is the last sampled coordinate then; None:
-    the errors are as they are.
+    """The surrogate: everything needed to evaluate it and to draw from it.
 
     x = centre + along @ z + across @ s. `data` and `prior` are Q in the features y for the errors as given; `linear`
-    turns s into the common eigenvectors of both, with eigenvalues `share` for the data, 1 − `share` for the priors,
-    `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h.
+    turns s into the common eigenvectors of both, with eigenvalues `share` for the data and 1 − `share` for the priors;
+    `slope` and `skew` are ∇_z and ∇_s of ln det H_ss. `pairs` and `triples` are the monomials of h. `scale` is the
+    fitted value of a common scale of the errors, whose ln f is then the last sampled coordinate; None: the errors are
+    as they are.
     """
 
     names: tuple[str, ...]
@@ -69,8 +67,8 @@ class Surrogate:
     across: Float[np.ndarray, "f s"]
     pairs: Int[np.ndarray, "p 2"]
     triples: Int[np.ndarray, "t 3"]
-    data: Matrix
-    prior: Matrix
+    data: Stacked
+    prior: Stacked
     linear: Float[np.ndarray, "s s"]
     share: Float[np.ndarray, " s"]
     slope: Float[np.ndarray, " k"]
@@ -90,11 +88,11 @@ class Surrogate:
         return self.scale * np.exp(ln_scale_unit(self.measured) * z[..., -1])
 
     def weight(self, z: Draws) -> Float[np.ndarray, " n"]:
-        """1/f² of every draw."""
+        """1/f² of every draw (n), f the factor on the errors."""
         return (self.scales(z) / (self.scale or 1.0)) ** -2
 
     def features(self, z: Draws) -> Float[np.ndarray, "n h"]:
-        """h for every draw."""
+        """The features h (n, h) of the equations in the head of this file, for every draw."""
         return np.asarray(features_of(jnp.asarray(z), jnp.asarray(self.pairs), jnp.asarray(self.triples)))
 
     def density(self) -> Density:
@@ -132,7 +130,7 @@ class Surrogate:
         physical = self.centre[self.sampled] + z[..., :k] @ self.along[self.sampled].T
         return physical if self.scale is None else np.append(physical, self.scales(z)[..., None], axis=-1)
 
-    def _tilted(self, form: Matrix) -> Matrix:
+    def _tilted(self, form: Stacked) -> Stacked:
         """A quadratic form in h with the linear term of the determinant added."""
         k, tilted = len(self.slope), form.copy()
         tilted[0, 1 : 1 + k] += 0.5 * self.slope
@@ -155,7 +153,7 @@ class Surrogate:
         return self.place(z, s)
 
     def place(self, z: Draws, s: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n f"]:
-        """Free parameters at given coordinates."""
+        """Free parameters (n, f) at given coordinates z and s."""
         return self.centre + z[:, : self.along.shape[1]] @ self.along.T + s @ self.across.T
 
     def moments(self, z: Draws) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f f"]]:
@@ -207,13 +205,13 @@ def _inflated(
     return -0.5 * chi2 - (measured - 1.0) * ln_f
 
 
-def _axes(covariance: Matrix, scale: Float[np.ndarray, " k"]) -> Matrix:
+def _axes(covariance: Stacked, scale: Float[np.ndarray, " k"]) -> Stacked:
     """A with A Aᵀ = covariance, columns along the principal axes in the units of `scale`."""
     value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
     return scale[:, None] * vector * np.sqrt(np.clip(value, value.max(initial=0.0) * 1e-15, None))
 
 
-def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix, Matrix]:
+def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Stacked, Stacked]:
     marginalised = np.setdiff1d(np.arange(len(target.free)), sampled)
     c, scale = target.covariance, target.scale
     axes = _axes(c[np.ix_(sampled, sampled)], scale[sampled])
@@ -225,7 +223,9 @@ def _coordinates(target: Target, sampled: Int[np.ndarray, " k"]) -> tuple[Matrix
     return along, across
 
 
-def _gram(target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None) -> Matrix:
+def _gram(
+    target: Target, x: Float[np.ndarray, "m f"], progress: Callable[[int, int], None] | None
+) -> Stacked:
     """Gram matrix of (r₀, r(x_1) − r₀, r(x_2) − r₀, …) over all data."""
     gram, batches = np.zeros((len(x) + 1, len(x) + 1)), target.likelihood.points
     for number, batch in enumerate(batches):
@@ -287,8 +287,8 @@ def build_surrogate(
     )  # fmt: skip
 
 
-def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) -> Matrix:
-    """Q of priors and loose pulls: they are linear in x, hence exact."""
+def _prior_form(target: Target, along: Stacked, across: Stacked, n_features: int) -> Stacked:
+    """Q of priors and weak pulls: they are linear in x, hence exact."""
     first = target.prior_rows(target.centre)
     rows = np.zeros((len(first), n_features))
     rows[:, 0] = first
@@ -298,7 +298,7 @@ def _prior_form(target: Target, along: Matrix, across: Matrix, n_features: int) 
 
 
 def _determinant_slopes(
-    target: Target, along: Matrix, across: Matrix
+    target: Target, along: Stacked, across: Stacked
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " s"]]:
     """Derivatives of ln det H_ss along both kinds of coordinates; columns of `across` make H_ss the unit matrix."""
     total, twice = np.zeros(len(target.centre)), 2.0 * target.half_gradient(target.centre)
@@ -308,7 +308,7 @@ def _determinant_slopes(
     return total @ along, total @ across
 
 
-def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray, " s"]]:
+def _common_axes(data: Stacked, prior: Stacked) -> tuple[Stacked, Float[np.ndarray, " s"]]:
     """W with Wᵀ (D + P) W = 1 and Wᵀ D W diagonal."""
     if len(data) == 0:
         return np.zeros((0, 0)), np.zeros(0)
@@ -321,7 +321,7 @@ def _common_axes(data: Matrix, prior: Matrix) -> tuple[Matrix, Float[np.ndarray,
 class Accuracy:
     """The surrogate against the exact posterior at `count` draws of the former, all coefficients together.
 
-    `spread` is the standard deviation of ln(exact/surrogate), `efficiency` the effective share of importance
+    `spread` is the standard deviation of ln(exact/surrogate), `efficiency` the effective fraction of importance
     weights. The exact posterior has means that differ by `shift` standard deviations and widths that differ
     by the factor `width` from those of the surrogate: the worst of all coefficients, ± one standard error.
     """

@@ -1,6 +1,6 @@
 """The posterior that is sampled, exactly as the fit minimises it, and which coefficients are sampled.
 
-    −2 ln p(x) = χ²(data) / noise_scale² + priors + loose pulls          fluxes eliminated as in `engine`
+    −2 ln p(x) = χ²(data) / noise_scale² + priors + weak pulls          fluxes eliminated as in `engine`
 
 Where errors of the data have parameters, the other terms of `likelihood/noise.py` are part of it.
 
@@ -26,7 +26,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import check_names, with_values
 from walop_jax.posterior.samplers import Density
 
-Vector = Float[np.ndarray, " f"]
+FreeValues = Float[np.ndarray, " f"]
 Draws = Float[np.ndarray, "n k"]
 LARGEST_SAMPLED = 20
 NEAR_LINEAR = ("throughput", "standard")
@@ -43,13 +43,13 @@ def ln_scale_unit(measured: int) -> float:
 
 
 class Target:
-    """−2 ln posterior of a fitted model in its free parameters x, around the fit at `centre`."""
+    """−2 ln posterior of a fitted model as a function of its free parameters x (f), around the fit at `centre`."""
 
     def __init__(self, result: FitResult) -> None:
         self.likelihood, self._near = result.likelihood, result.expansion
         self.model = result.model
         self.free = result.model.free
-        self.centre: Vector = result.values[self.free]
+        self.centre: FreeValues = result.values[self.free]
         self.covariance: Float[np.ndarray, "f f"] = result.covariance[np.ix_(self.free, self.free)]
         self.noise_scale, self._fitted = result.noise_scale, result.values
 
@@ -59,13 +59,15 @@ class Target:
         return tuple(self.model.names[i] for i in self.free)
 
     @property
-    def scale(self) -> Vector:
-        """A typical step of each free parameter (its prior width, or what preconditions the solver)."""
+    def scale(self) -> FreeValues:
+        """A typical step (f) of each free parameter: the natural step of the solver."""
         return np.array([self.model.parameters[i].scale for i in self.free])
 
     @property
     def measured(self) -> int:
-        """Independent data of all used rows: an intensity for each camera, less its part of the unknown fluxes."""
+        """Independent data of all used rows: an intensity for each camera, less the fraction of the unknown fluxes of
+        the row.
+        """
         return round(float(self.likelihood.used.sum(axis=0) @ self.likelihood.data_per_row))
 
     @property
@@ -74,18 +76,18 @@ class Target:
         scale = self.scale
         return scale[:, None] * np.linalg.cholesky(self.covariance / np.outer(scale, scale))
 
-    def values(self, x: Vector) -> Float[np.ndarray, " n"]:
-        """All parameters, frozen and tied ones included."""
+    def values(self, x: FreeValues) -> Float[np.ndarray, " n"]:
+        """All parameters, fixed and tied ones included."""
         return self.model.full(x, self._fitted)
 
-    def residuals(self, x: Vector, batch: engine.PointData) -> Float[np.ndarray, " d"]:
+    def residuals(self, x: FreeValues, batch: engine.PointData) -> Float[np.ndarray, " d"]:
         """Normalised residuals of one batch of the data, errors times `noise_scale`."""
         instrument = _instrument(self.model.template, jnp.asarray(self.values(x)))
         _, r = engine.residuals(instrument, self.likelihood.plan, batch)
         return np.asarray(r).ravel() / self.noise_scale
 
-    def prior_rows(self, x: Vector) -> Float[np.ndarray, " k"]:
-        """Normalised residuals of priors and loose pulls: linear in x."""
+    def prior_rows(self, x: FreeValues) -> Float[np.ndarray, " k"]:
+        """Normalised residuals of priors and weak pulls: linear in x."""
         return self.likelihood.priors.residuals(self.values(x))
 
     def prior_slopes(self, steps: Float[np.ndarray, "f m"]) -> Float[np.ndarray, "k m"]:
@@ -104,15 +106,15 @@ class Target:
                 total[m] += np.sum((0.5 * (up + down) - at_centre) ** 2)
         return total
 
-    def half_gradient(self, x: Vector) -> Vector:
+    def half_gradient(self, x: FreeValues) -> FreeValues:
         """Half the gradient of the objective."""
         return self.likelihood.expand(self.values(x), self.noise_scale, self._near).gradient
 
-    def data(self, x: Vector) -> float:
+    def data(self, x: FreeValues) -> float:
         """χ² of the data, errors times `noise_scale`."""
         return sum(float(np.sum(self.residuals(x, batch) ** 2)) for batch in self.likelihood.points)
 
-    def objective(self, x: Vector) -> float:
+    def objective(self, x: FreeValues) -> float:
         """−2 ln posterior, up to a constant."""
         return self.data(x) + float(np.sum(self.prior_rows(x) ** 2))
 
@@ -161,7 +163,7 @@ class ExactPosterior:
         """Free parameters at sampled coordinates; nothing is left to be drawn."""
         return self.target.centre + z @ self.target.root.T
 
-    def moments(self, z: Draws) -> tuple[Vector, Float[np.ndarray, "f f"]]:
+    def moments(self, z: Draws) -> tuple[FreeValues, Float[np.ndarray, "f f"]]:
         """Mean and covariance of all free parameters over draws."""
         x = self.draw(z, np.random.default_rng(0))
         return x.mean(axis=0), np.cov(x, rowvar=False).reshape(2 * (x.shape[1],))

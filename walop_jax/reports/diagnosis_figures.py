@@ -86,9 +86,9 @@ def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE)
 def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
     """Rms residuals of the starting and the final model over the field, rows and scale as in `residual_maps`.
 
-    Several effects need not show in one combination of the exposures: rms over all of them. Standards lie between the
-    other points and are measured in other exposures: left out, if need be. Noise alone gives √(1 − 1/K) with K cameras
-    and a free flux: 0.87 of four.
+    Several effects need not show in one combination of the exposures: the rms is over all exposures. Standards lie
+    between the other points and are measured in other exposures; they are left out where there are other points. Noise
+    alone gives √(1 − 1/K) with K cameras and a free flux: 0.87 for four.
     """
     overall = data.comparisons[0].field
     measured = np.isfinite(overall["BEFORE"])

@@ -33,7 +33,9 @@ RELEVANT = 1e-4  # of the largest change of a matrix: the scale of no map is sma
 def residuals_figure(
     likelihood: Likelihood, values: Parameters, before: Parameters, on: Canvas = PAGE
 ) -> AnyFigure:
-    """Residuals of every field point before and after a fit, full vectors of parameters; a histogram of the latter."""
+    """Residuals of every field point before and after a fit (full vectors of parameters), and a histogram of those
+    after it.
+    """
     figure, ((left, middle, right),) = on.panels(9.6, 3.0, 1, 3, least=1.6)
     _before_and_after((left, middle), likelihood, before, values)
     middle.set_ylabel("")
@@ -83,7 +85,7 @@ def point_residuals(likelihood: Likelihood, values: Parameters) -> Float[np.ndar
 def _histogram(axis: Axes, likelihood: Likelihood, values: Parameters) -> None:
     """All residuals of a fit, and what noise alone would give."""
     _, residual = likelihood.residuals(values)
-    # A flux takes the share y²/Σy² of the variance of every intensity y, in units of its error.
+    # A flux takes the fraction y²/Σy² of the variance of every intensity y, in units of its error.
     square = (likelihood.points.gathered("counts") * likelihood.points.gathered("weight")) ** 2
     together = likelihood.model.template.cameras.together
     power = square @ (np.ones((likelihood.cameras,) * 2) if together is None else np.asarray(together))
@@ -145,7 +147,9 @@ def modulation_figure(
 
 @styled
 def matrix_maps_figure(maps: MatrixMaps, kind: int | None = None, on: Canvas = PAGE) -> AnyFigure:
-    """The elements of the matrix over the field; `kind`: those of one name in Paper II (place in `PAPER_NAMES`)."""
+    """The elements of the matrix over the field; with `kind` only the elements of one name in Paper II (index in
+    `PAPER_NAMES`).
+    """
     chosen = [i for i in range(len(maps.values)) if kind in (None, style.element_kind(i, maps.arms))]
     if not chosen:
         what = f"no element of the matrix of {maps.arms} arms is {style.PAPER_NAMES[kind or 0]}"
@@ -176,9 +180,10 @@ def matrix_errors_figure(maps: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def matrix_change_figure(old: MatrixMaps, new: MatrixMaps, on: Canvas = PAGE) -> AnyFigure:
-    """Change of the matrix over the field (%), a scale for each element; ValueError for maps of other places.
+    """Change of the matrix over the field (%), with a scale for each element.
 
-    A scale that two elements share would show nothing of the smaller one.
+    A scale that two elements share would show nothing of the smaller one. Raises ValueError for maps of different
+    places.
     """
     if field_of(old) != field_of(new) or old.values.shape != new.values.shape:
         raise ValueError("the maps of the two calibrations are of different places")
@@ -237,7 +242,7 @@ _RANGE = (1e-4, 3.0)  # per cent
 
 @styled
 def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
-    """The error of p over the field (%, logarithmic; a line at the goal), and the share of the field that has it."""
+    """The error of p over the field (%, logarithmic; a line at the goal), and the fraction of the field that has it."""
     goal = 100.0 * accuracy.goal
     percent = np.clip(100.0 * np.nan_to_num(accuracy.error, nan=np.inf), *_RANGE)
     figure, ((left, right),) = on.panels(8.2, 3.4, 1, 2, width_ratios=(1.15, 1.0))
@@ -257,7 +262,7 @@ def accuracy_figure(accuracy: FieldAccuracy, on: Canvas = PAGE) -> AnyFigure:
     )  # fmt: skip
     right.set(xscale="log", xlim=(min(edges[0], goal / 1.5), max(edges[-1], 1.5 * goal)))
     style.plain_ticks(right.xaxis)
-    right.set(xlabel="error of p (%)", ylabel="share of the field (%)")
+    right.set(xlabel="error of p (%)", ylabel="fraction of the field (%)")
     return figure
 
 

@@ -97,7 +97,7 @@ def _signature(source: FigureSource) -> AnyFigure:
 
 
 def _cameras(source: FigureSource) -> Cameras | None:
-    """Those of an instrument, which the product knows; None without one."""
+    """The cameras of the instrument, which the product knows; None without a product."""
     return None if source.calibration is None else source.calibration.design.cameras
 
 

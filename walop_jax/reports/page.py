@@ -74,7 +74,7 @@ class Page(Displayed):
     missing: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The page's path, length and missing files as plain data."""
         return {"page": str(self.path), "bytes": self.length, "missing": list(self.missing)}
 
     def display(self) -> Display:
@@ -83,7 +83,7 @@ class Page(Displayed):
 
 
 class Picture(NamedTuple):
-    """An image as a data URI, its caption, whether it takes half of the width; the same image for a narrow screen."""
+    """An image as a data URI, its caption, whether it takes half of the width; `narrow` is it for a narrow screen."""
 
     source: str
     caption: str
@@ -262,7 +262,7 @@ def _with_goal(head: Display, run: RunContents, accuracy: FieldAccuracy, *, comp
 
 
 def _accuracy_pictures(run: RunContents) -> list[Picture]:
-    """The error of p over the field, and the effect of a mistake that goes unnoticed."""
+    """The error of p over the field, and the effect of a systematic error that goes unnoticed."""
     if run.calibration is None:
         return []
     pictures = drawn(run.source, ["accuracy"], run.missing, filter=run.calibration.maps.filter)
@@ -419,7 +419,9 @@ def _next(run: RunContents, trusted: bool) -> list[tuple[str, str]]:
     if run.diagnosis is None:
         steps.append(("look for missing effects", f"walop-jax diagnose {sets} -o {other}"))
     if run.limits is None and trusted:
-        steps.append(("list mistakes that these data would not show", f"walop-jax limits {sets} -o {name}"))
+        steps.append(
+            ("list systematic errors that these data would not show", f"walop-jax limits {sets} -o {name}")
+        )
     left = {} if run.diagnosis is None else run.diagnosis["unexplained"]
     if left:
         # Further exposures of the same kind show an unknown effect again: they do not name it.

@@ -17,6 +17,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import instrument_of
 from walop_jax.io.errors import DataError
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import with_minus_sign
 from walop_jax.model.cameras import Cameras
 from walop_jax.model.instrument import Instrument
@@ -24,7 +25,7 @@ from walop_jax.paper.comparison import Comparison
 from walop_jax.paper.polynomial import fit_paper, fit_transmissions, polariser_states
 from walop_jax.paper.wavelength import plate_names, plate_retardances
 from walop_jax.reports import style
-from walop_jax.reports.style import PAGE, AnyFigure, Canvas, Places, styled
+from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
 from walop_jax.science.star_errors import QUANTITIES, plate_errors, transmitted
 
 _PIXELS, _LINES = 31, 41
@@ -79,7 +80,7 @@ def retardance_wavelength_figure(calibration: Calibration, on: Canvas = PAGE) ->
 
 
 def _unwrapped_retardances(
-    instrument: Instrument, line: Float[np.ndarray, " w"], x: Places, y: Places
+    instrument: Instrument, line: Float[np.ndarray, " w"], x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "n p w"]:
     """Retardances (deg) of plates at places and wavelengths (µm), without jumps of 360°.
 
@@ -127,7 +128,7 @@ def transmission_figure(
     on: Canvas = PAGE,
     cameras: Cameras | None = None,
 ) -> AnyFigure:
-    """Share of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
+    """Fraction of the light in each camera against the polariser angle at the field point nearest to `place` (deg).
 
     With the model of Paper II, a constant plus terms in q and u of the polariser; its residuals below.
     """
@@ -157,7 +158,7 @@ def transmission_figure(
     below.axhline(0.0, color="0.6", lw=0.8)
     where = with_minus_sign(f"({block.x[point]:+.2f}°, {block.y[point]:+.2f}°)")
     above.set_title(f"{where}, {filter_name}", loc="left")
-    above.set_ylabel("share of the light")
+    above.set_ylabel("fraction of the light")
     below.set(xlabel="polariser angle (deg)", ylabel="residual (%)")
     figure.legend(*above.get_legend_handles_labels(), frameon=False, ncols=len(names), loc=style.ABOVE)
     style.angle_ticks(below)

@@ -45,10 +45,10 @@ Drawable = FitResult | Calibration | Diagnosis | PosteriorSample | Run | Compari
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FigureSource:
-    """The run, or the result in memory, that a figure is drawn from; missing data are a `DataError`.
+    """The run, or the result in memory, from which a figure is drawn; missing data are a `DataError`.
 
-    `held` are the contents of a result in memory under the names of the files of a run that would hold them, its data
-    as `DATA`, others under names of their own; it has no `run`. `sample` is a posterior in memory, which has the
+    `held` are the contents of a result in memory, under the names of the files of a run that would hold them; its data
+    are `DATA`, others have names of their own; it has no `run`. `sample` is a posterior in memory, which has the
     walkers as well. `parameters` are coefficients by name; `place` (deg) is a field point, or several for the
     modulation; `step` numbers the effects of a diagnosis; `reference` are values to be marked, by name; `canvas` is
     where to draw, `goal` the error of p that is wanted.
@@ -85,7 +85,7 @@ class FigureSource:
         return cls(held=held, **options)
 
     def on(self, canvas: Canvas) -> FigureSource:
-        """The same source with another canvas; computed results are kept."""
+        """This source with another canvas; results that were computed are kept."""
         other = copy.copy(self)
         object.__setattr__(other, "canvas", canvas)
         return other
@@ -117,7 +117,7 @@ class FigureSource:
 
     @property
     def required_calibration(self) -> Calibration:
-        """The same; `DataError` without one."""
+        """The calibration of the run or in memory; `DataError` without one."""
         return self._wanted(names.PRODUCT, lambda run: run.calibration)
 
     @property

@@ -28,6 +28,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, NullLocator, ScalarF
 from scipy.spatial import KDTree
 
 from walop_jax.calibration.accuracy import SMALLEST_DETERMINANT
+from walop_jax.io.shapes import OfPoints
 from walop_jax.io.text import with_minus_sign
 from walop_jax.sky.nights import FIRST_DATE
 
@@ -57,7 +58,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Map = Float[np.ndarray, "y x"]
 Maps = Float[np.ndarray, "m y x"]
-Places = Float[np.ndarray, " p"]  # at field points
 Field = tuple[float, float, float, float]
 AnyFigure = Any  # a figure on a `Canvas`, or the subfigure that took the room of axes
 
@@ -244,9 +244,9 @@ def pixel_map(
 def point_map(
     axis: Axes,
     title: str,
-    x: Places,
-    y: Places,
-    values: Places,
+    x: OfPoints,
+    y: OfPoints,
+    values: OfPoints,
     norm: Normalize,
     colours: str,
     shown: Bool[np.ndarray, " p"] | None = None,
@@ -271,15 +271,15 @@ def point_map(
     return tiles
 
 
-def error_map(axis: Axes, title: str, x: Places, y: Places, percent: Places, norm: Normalize) -> Any:
+def error_map(axis: Axes, title: str, x: OfPoints, y: OfPoints, percent: OfPoints, norm: Normalize) -> Any:
     """Tiles of an error of q, u or p at field points; crosses (NaN): a single exposure does not measure u there."""
     blind = np.isnan(percent)
     axis.plot(x[blind], y[blind], "x", color="0.5", ms=4, label="u not measured in one exposure")
     return point_map(axis, title, x, y, percent, norm, SEQUENTIAL)
 
 
-def nearest_apart(x: Places, y: Places) -> Places:
-    """Distance of each point from the next at another place, the larger of those along X and Y.
+def nearest_apart(x: OfPoints, y: OfPoints) -> OfPoints:
+    """Distance of each point from the next point at another place: the larger of the distances along X and Y.
 
     Squares with these sides do not overlap. Infinite for a point that is alone.
     """
@@ -290,7 +290,7 @@ def nearest_apart(x: Places, y: Places) -> Places:
     return np.asarray(distance)[:, 1][number.ravel()]
 
 
-def _spacing(x: Places, y: Places) -> float:
+def _spacing(x: OfPoints, y: OfPoints) -> float:
     """Side of the tiles: the typical distance to the nearest neighbour."""
     few = slice(0, MOST_VECTOR)
     distance = np.hypot(x[few, None] - x[None, few], y[few, None] - y[None, few])
@@ -301,9 +301,10 @@ def _spacing(x: Places, y: Places) -> float:
 
 
 def colour_bar(image: Any, label: str = "", axes: Any = None, **options: Any) -> Any:
-    """A colour bar with small numbers, plain ones on a logarithmic scale: of all `axes`, or of a map, in its height.
+    """A colour bar with small numbers, plain ones on a logarithmic scale: for all `axes`, or for one map, in its
+    height.
 
-    In a column of print that of a map has three numbers at most: there is no room for 99.95 beside the next.
+    In a column of print the bar of one map has three numbers at most: there is no room for 99.95 beside the next.
     """
     figure = image.axes.figure
     place = (
@@ -390,7 +391,8 @@ def rounded_up(value: float) -> float:
 # ------------------------------------------------------------------------------------------ the instrument matrix
 
 PAPER_NAMES = ("zero offset", "efficiency", "cross-talk")
-"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; those of u are m31, m33, m32."""
+"""Names in Paper II of the elements of the arm that measures q: m21, m22, m23; of the arm that measures u: m31, m33,
+m32."""
 
 
 def element_symbols(arms: int) -> tuple[str, ...]:
@@ -399,7 +401,7 @@ def element_symbols(arms: int) -> tuple[str, ...]:
 
 
 def element_kind(element: int, arms: int) -> int:
-    """Place in `PAPER_NAMES` of an element of the matrix; with a single arm nothing is the cross-talk of another."""
+    """Index in `PAPER_NAMES` of an element of the matrix; with a single arm no element is the cross-talk of another."""
     arm, column = divmod(element, 3)
     if column == 0 or arms != 2:
         return min(column, 1)

@@ -19,7 +19,7 @@ MOST = 8  # parameters in a figure
 
 
 def tracked(document: Mapping[str, Any]) -> list[str]:
-    """Parameters of a survey that change: those with breaks, then others whose law lets them."""
+    """Parameters of a survey that change: first those with breaks, then others that their law allows to change."""
     broken = [entry["name"] for entry in document["breaks"]]
     return [*dict.fromkeys([*broken, *document["laws"]])][:MOST]
 

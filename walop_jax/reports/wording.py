@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
+from walop_jax.io.errors import DataError
 from walop_jax.io.text import date_of, some, with_minus_sign
 from walop_jax.model.effects import EFFECTS, EffectKind
 from walop_jax.model.effects.free_form import FreeForm
@@ -41,7 +42,7 @@ _KINDS = {"clp": "through the polariser", "moon": "of the moonlit sky", "standar
 
 def data_in_words(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     """Nights, exposures, polariser angles, plate settings, Moon patches, standards, temperatures, filters."""
-    e = calibration.exposures
+    e, in_words = calibration.exposures, _reading_in_words(calibration)
     counts = Counter(e.kind.tolist()).items()
     kinds = ", ".join(f"{number} {_KINDS.get(kind, kind)}" for kind, number in counts)
     low_x, high_x, low_y, high_y = calibration.field
@@ -54,7 +55,11 @@ def data_in_words(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     for prefix, p in e.positions.items():
         if prefix != POLARISER:
             name = "Calibration plate" if prefix == CALIBRATION_PLATE else prefix
-            rows.append((name, _settings(p.angle[p.inside], bool((~p.inside).any()))))
+            said = {
+                in_words(prefix, float(reading)): None
+                for reading in np.unique(np.round(p.angle[p.inside], 3))
+            }
+            rows.append((name, some([*(["out"] if (~p.inside).any() else []), *said], _MANY)))
     moon = e.direct("moon")
     places = {(round(float(a), 3), round(float(d), 3)) for a, d in zip(e.ra[moon], e.dec[moon], strict=True)}
     standards = some([str(name) for name in calibration.sources.name], _MANY)
@@ -65,6 +70,14 @@ def data_in_words(calibration: Calibration) -> tuple[tuple[str, str], ...]:
         ("Filters", ", ".join(sorted({str(name) for name in e.filter}))),
     ]
     return tuple(rows)
+
+
+def _reading_in_words(calibration: Calibration) -> Callable[[str, float], str]:
+    """`Instrument.reading_in_words`; the number alone where a class of the instrument is missing in this process."""
+    try:
+        return calibration.design.reading_in_words
+    except DataError:
+        return lambda _, reading: with_minus_sign(f"{reading:g}")
 
 
 def _nights(mjd: Float[np.ndarray, " e"], longitude: float) -> str:
@@ -82,11 +95,6 @@ def _angles(angles: Float[np.ndarray, " a"]) -> str:
     gap = np.diff(np.append(turn, turn[0] + 180.0)).max()
     full = ", over a full turn" if np.ptp(np.mod(angles, 360.0)) > 180.0 else ""
     return f"{len(turn)} modulo 180°, widest gap {gap:.3g}°{full}"
-
-
-def _settings(angles: Float[np.ndarray, " a"], out: bool) -> str:
-    texts = (["out"] if out else []) + [f"{angle:g}°" for angle in np.unique(np.round(angles, 3))]
-    return some(texts, _MANY)
 
 
 def _range(values: Float[np.ndarray, " e"], unit: str) -> str:

@@ -26,15 +26,15 @@ from walop_jax.sky.nights import night_of
 
 ASKED = "ask the catalogues that the old calibration has made, by that calibration"
 LIMIT = 0.5  # standard errors; a result that is off by a quarter of its variance is made again
-MOST = 0.95  # share of the stars of a night that may shift by no more than the limit
+MOST = 0.95  # fraction of the stars of a night that may shift by no more than the limit
 
 
 class NightShift(NamedTuple):
-    """Stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
+    """The stars of a night in one catalogue: their shift (standard errors), and the mean shift of q and u themselves.
 
-    The mean is weighted by the old errors: where q or u is hardly measured, shifts are large and mean nothing.
-    `night` is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old
-    calibration alone, `gained` ones by the new one alone, `beyond` ones have settings that the new one does not cover.
+    The mean is weighted by the old errors: where q or u is hardly measured, shifts are large and mean nothing. `night`
+    is the MJD of the evening, NaN where the catalogue has no times. `lost` stars have a result by the old calibration
+    alone, `gained` stars by the new one alone, `beyond` stars have settings that the new calibration does not cover.
     """
 
     catalogue: str
@@ -101,7 +101,7 @@ class Affected(Displayed):
         return "again: one calibration is trusted, the other is not"
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The nights as plain data, the part `affected` of check.json."""
         nights = [night._asdict() for night in self.nights]
         return dataclasses.asdict(self) | {"again": list(self.again), "nights": nights}
 

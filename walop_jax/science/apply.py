@@ -22,7 +22,8 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.settings import Settings
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.errors import DataError, rows_text
-from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
+from walop_jax.io.shapes import ByRowAndCamera, RowIndex
+from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
@@ -37,13 +38,11 @@ from walop_jax.science.own_light import OwnLight, OwnLightCheck, own_light_check
 from walop_jax.science.star_residuals import StarResiduals, by_place
 from walop_jax.sky.position_angles import sky_to_instrument
 
-OfRows = Float[np.ndarray, "r k"]  # by row and camera
-Rows = Int[np.ndarray, " r"]
-Pairs = Float[np.ndarray, "s 2"]
-Covariances = Float[np.ndarray, "s 2 2"]
+QuOfStars = Float[np.ndarray, "s 2"]
+QuCovariances = Float[np.ndarray, "s 2 2"]
 Told = Callable[[int, int], None] | None
-Chosen = Bool[np.ndarray, " s"]
-OfStars = Int[np.ndarray, " s"]
+ChosenStars = Bool[np.ndarray, " s"]
+StarNumbers = Int[np.ndarray, " s"]
 STAR_SAMPLE = 16384
 """Rows of a catalogue, spread over it, by which the whole of it is judged: they see a camera that has changed by a
 fiftieth of what single stars of 10⁶ electrons would show."""
@@ -54,7 +53,7 @@ STAR_ROWS = 16384  # rows of a star catalogue that are worked on together: their
 MOST_SETTINGS = 200
 ILL_POSED = 10.0  # ratio of the errors of the two principal directions from which FLAG 16 is set
 _EXPANSIONS = 8  # of the counts, about the errors of the calibration that explain the stars best, …
-_STRAIGHT = 0.01  # … until second derivatives make less difference than this share of the noise, squared
+_STRAIGHT = 0.01  # … until second derivatives make less difference than this fraction of the noise, squared
 _KNOWN = 0.1  # error of q and u together from which a star says nothing of the arms
 IMPROBABLE = 1e-6  # probability of a CHI2 as large below which FLAG 131072 is set, …
 ROUGH = 0.005
@@ -65,32 +64,33 @@ ROUGH = 0.005
 class Stars:
     """Stokes parameters of the stars of a catalogue, in the order of `Catalogue.star`.
 
-    On the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere. `covariance`
-    is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum`: a TEFF has its
-    error, a star without one the colour of a population (`COOL`, `HOT`), and `changed`: changes since the calibration
-    that the whole catalogue shows. `colour` is the error of (q, u) if TEFF were ignored; without TEFF, half the
-    difference between stars of 3500 K and 10 000 K. `hidden` is the largest shift of q and u by a single mistake that
-    the data of the calibration would not have shown (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts
-    the rows of a star. `check` is that of all stars together, `sky_bound` the largest shift by light of the sky left
-    over that they do not exclude (None: the level of the sky is not stated).
+    They are on the sky (equatorial frame) where the catalogue has a ROTATOR, in the instrument frame elsewhere.
+    `covariance` is the sum of `photon`, `calibration` (parameters of the optics and of the detectors), `spectrum` and
+    `changed`: `spectrum` is the error of a TEFF or, for a star without one, the spread of colours of a population
+    (`COOL`, `HOT`), and `changed` comes from changes since the calibration that the whole catalogue shows. `colour` is
+    the error of (q, u) if TEFF were ignored; without TEFF, half the difference between stars of 3500 K and 10 000 K.
+    `hidden` is the largest shift of q and u by a single error that the data of the calibration would not have shown
+    (NaN: not computed). `flag` holds bits of `Quality`; `rows` counts the rows of a star. `check` is the check of all
+    stars together, `sky_bound` the largest shift by leftover light of the sky that the stars do not exclude (None: the
+    level of the sky is not stated).
     """
 
-    qu: Pairs
-    photon: Covariances
-    calibration: Covariances
-    spectrum: Covariances
-    changed: Covariances
-    colour: Pairs
-    hidden: Pairs
+    qu: QuOfStars
+    photon: QuCovariances
+    calibration: QuCovariances
+    spectrum: QuCovariances
+    changed: QuCovariances
+    colour: QuOfStars
+    hidden: QuOfStars
     chi2: Float[np.ndarray, " s"]
-    dof: OfStars
-    rows: OfStars
-    flag: OfStars
+    dof: StarNumbers
+    rows: StarNumbers
+    flag: StarNumbers
     check: CatalogueCheck = NOTHING_TO_SPARE
     sky_bound: Float[np.ndarray, " s"] | None = None
 
     @property
-    def covariance(self) -> Covariances:
+    def covariance(self) -> QuCovariances:
         """Covariance of (q, u), all causes together."""
         return self.photon + self.calibration + self.spectrum + self.changed
 
@@ -152,12 +152,12 @@ def residuals_of(
 class _Block(NamedTuple):
     """Rows of whole stars and all that was computed for them; `rows` are those of the catalogue."""
 
-    rows: Rows
-    star: Rows
+    rows: RowIndex
+    star: RowIndex
     stars: Stars
     found: Estimate
     vectors: Float[np.ndarray, "r k 3"]
-    sigma: OfRows
+    sigma: ByRowAndCamera
     plain: Float[np.ndarray, "r k o"]
     throughput: Float[np.ndarray, "r k k"]
     colour: Float[np.ndarray, "r k 2"]
@@ -184,12 +184,12 @@ class _Application:
         filters, of = np.unique(catalogue.points.settings.filter, return_inverse=True)
         self.filter = filters[np.argmax(np.bincount(of.reshape(-1)))]
 
-    def blocks(self) -> Iterator[tuple[int, Rows]]:
+    def blocks(self) -> Iterator[tuple[int, RowIndex]]:
         """Rows of whole stars, each with the number of rows done after it."""
         for done, rows in _slices_of_stars(self.catalogue.star[self.order]):
             yield done, self.order[rows]
 
-    def block(self, rows: Rows) -> _Block:
+    def block(self, rows: RowIndex) -> _Block:
         """Stokes parameters of some stars."""
         catalogue, vectors, setting_of = self.catalogue, self.vectors, self.setting_of[rows]
         points, sigma, counts = catalogue.points, self.sigma[rows], self.counts[rows]
@@ -236,10 +236,10 @@ class _Application:
             derivative += (fitted.gain @ turned[..., None]) * self.slope
         derivative = np.add.reduceat(-derivative, first)
 
-        def change_of(weights: Float[np.ndarray, "r c"]) -> OfRows:
+        def change_of(weights: Float[np.ndarray, "r c"]) -> ByRowAndCamera:
             return np.einsum("rc,rcks,rs->rk", weights, spectra, s, optimize=True)
 
-        def shift(change: OfRows) -> Pairs:
+        def shift(change: ByRowAndCamera) -> QuOfStars:
             return calibration_shift(fitted.gain, change[..., None], star)[..., 0]
 
         hidden = _hidden(vectors, derivative, {number: shift(change) for number, change in acting.items()})
@@ -280,14 +280,16 @@ class _Application:
         )
         return _Block(rows, star, stars, fitted, on_sky, sigma, plain, throughput, colour, derivative)
 
-    def outside(self, rows: Rows) -> Bool[np.ndarray, " r"]:
+    def outside(self, rows: RowIndex) -> Bool[np.ndarray, " r"]:
         """Rows beyond the field of the instrument, or too far beyond that of the calibration to mean anything."""
         points = self.catalogue.points
         return points.outside[rows] | (
             np.maximum(np.abs(points.x[rows]), np.abs(points.y[rows])) > self.vectors.half_width
         )
 
-    def flags(self, rows: Rows, counts: OfRows, first: OfStars, found: Estimate) -> OfStars:
+    def flags(
+        self, rows: RowIndex, counts: ByRowAndCamera, first: StarNumbers, found: Estimate
+    ) -> StarNumbers:
         """Quality bits of every star: those of its rows and of the calibration, and three that need all of its rows."""
         points, sigma = self.catalogue.points, self.sigma[rows]
         settings, calibration = points.settings[rows], self.vectors.calibration
@@ -312,12 +314,12 @@ class _Application:
 
     # ------------------------------------------------------------------------------ the catalogue as a whole
 
-    def sample(self, most: int) -> Chosen:
+    def sample(self, most: int) -> ChosenStars:
         """A sample of the stars, about `most` rows of them, spread by multiples of the golden section."""
         stars = np.arange(self.catalogue.star.max() + 1)
         return np.mod(stars * 0.6180339887498949, 1.0) < most / len(self.catalogue)
 
-    def residuals(self, block: _Block, chosen: Chosen) -> list[StarResiduals]:
+    def residuals(self, block: _Block, chosen: ChosenStars) -> list[StarResiduals]:
         """Residuals of the chosen stars of a block: none, or one list of those that have a result within the field."""
         catalogue, vectors, stars = self.catalogue, self.vectors, block.stars
         number = catalogue.star[block.rows]
@@ -327,7 +329,7 @@ class _Application:
         r = np.flatnonzero(good[block.star])
         if not r.size:
             return []
-        rows, shared = block.rows[r], Sharing(vectors.instrument.cameras.together)
+        rows, shared = block.rows[r], FluxGroups(vectors.instrument.cameras.together)
         sigma, counts = block.sigma[r], self.counts[rows]
         used = np.isfinite(counts) & np.isfinite(sigma) & (sigma > 0)
         root = np.where(used, 1.0 / np.where(used, sigma, 1.0), 0.0)
@@ -357,7 +359,7 @@ class _Application:
         )
         return [residuals]
 
-    def readings(self, chosen: Chosen, *, doubted: bool = False) -> CatalogueReadings | None:
+    def readings(self, chosen: ChosenStars, *, doubted: bool = False) -> CatalogueReadings | None:
         """Other readings of the rows of some bright ones of the chosen stars; `None` where nothing can be said."""
         catalogue = self.catalogue
         points, r = catalogue.points, np.flatnonzero(chosen[catalogue.star] & ~catalogue.copy)
@@ -375,7 +377,7 @@ class _Application:
         """The cameras of the arms that have two."""
         return [(arm[0], arm[1]) for arm in self.vectors.instrument.cameras.arms if len(arm) == 2]
 
-    def own_light(self, block: _Block, chosen: Chosen) -> list[OwnLight]:
+    def own_light(self, block: _Block, chosen: ChosenStars) -> list[OwnLight]:
         """q and u of the chosen stars of a block, with what moves them: none, or one list."""
         catalogue, stars = self.catalogue, block.stars
         first = np.flatnonzero(np.diff(block.star, prepend=-1))
@@ -408,7 +410,7 @@ class _Application:
         named = [(names[first], names[second]) for first, second in self.arms]
         return own_light_check(OwnLight.joined(parts), named) if parts else None
 
-    def checked(self, watched: list[StarResiduals], chosen: Chosen) -> CatalogueCheck:
+    def checked(self, watched: list[StarResiduals], chosen: ChosenStars) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
 
         Errors of the calibration move the stars in proportion only while they are small beside the scale on which the
@@ -451,7 +453,7 @@ class _Application:
         photon = stars.photon * np.where(stars.rows > 1, check.scale[1], check.scale[0])[:, None, None]
         return dataclasses.replace(stars, photon=photon, changed=changed, flag=flag, check=check)
 
-    def _changed(self, block: _Block, check: CatalogueCheck) -> tuple[Covariances, Chosen]:
+    def _changed(self, block: _Block, check: CatalogueCheck) -> tuple[QuCovariances, ChosenStars]:
         """Effect on stars of changes, of those alike the largest in q and in u; True for stars at a place."""
         points, fitted = self.catalogue.points, block.found
         cameras = self.vectors.instrument.cameras.names
@@ -459,7 +461,7 @@ class _Application:
         counts = np.nan_to_num(self.counts[block.rows])
         place = (points.x[block.rows], points.y[block.rows], self.catalogue.time[block.rows])
 
-        def shift(entry: PossibleChange) -> Pairs:
+        def shift(entry: PossibleChange) -> QuOfStars:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
             grown, k = np.zeros_like(counts), cameras.index(entry.name)
@@ -499,7 +501,7 @@ def _slices_of_stars(star: Int[np.ndarray, " n"]) -> Iterator[tuple[int, slice]]
         start = end
 
 
-def _rows_by_setting(setting_of: Rows) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
+def _rows_by_setting(setting_of: RowIndex) -> Iterator[tuple[int, Int[np.ndarray, " w"]]]:
     for k in np.unique(setting_of):
         yield int(k), np.flatnonzero(setting_of == k)
 
@@ -551,8 +553,8 @@ def _settings(vectors: AnalysisVectors, catalogue: Catalogue) -> tuple[list[Sett
 
 def _hidden(
     vectors: AnalysisVectors, derivative: Float[np.ndarray, "s 2 n"], acting: Mapping[int, np.ndarray]
-) -> Pairs:
-    """Largest shift of q and u by one of the mistakes that would not have been found; NaN where not computed.
+) -> QuOfStars:
+    """Largest shift of q and u by one of the systematic errors that would not have been found; NaN where not computed.
 
     `acting` are the shifts by those that act on starlight (`AnalysisVectors.acting`): parameters make up for a part.
     """

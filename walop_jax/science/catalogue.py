@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from walop_jax.data import plausible, user_tables
 from walop_jax.data.repeats import equal_rows
@@ -16,16 +16,15 @@ from walop_jax.data.schema import EXPOSURES, MISSING, Column, check, plain_colum
 from walop_jax.data.units import Place
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
+from walop_jax.io.shapes import CountsOfRows, Vector
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.catalogue_doubts import errors_of_cameras, field_against_sky, units_of_counts
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
 from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
 
-Counts = Float[np.ndarray, "n k"]  # by row and camera
-OfRows = Float[np.ndarray, " n"]
-Numbers = Int[np.ndarray, " n"]
-Chosen = Bool[np.ndarray, " n"]
+RowNumbers = Int[np.ndarray, " n"]
+ChosenRows = Bool[np.ndarray, " n"]
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 SAME_PLACE = 1.0  # arcsec
 ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
@@ -36,32 +35,32 @@ class Catalogue:
     """The rows of a science catalogue.
 
     `points` are positions and settings, `teff_err` the errors of the colour temperatures [K] (0: none); `counts` and
-    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged, `copy`
-    those that repeat another row of their star to the last bit, which are not used, and `repeated` those that have the
-    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level subtracted
-    (None: not stated), `rotator` [deg] NaN for results in the instrument frame, `time` [MJD, d] where it is not known.
-    `remarks` name oddities of the table, and unused columns; `doubts` are about all of it: its results are not to be
-    trusted.
+    `sigma` [electron] are NaN where a camera is not used; `spoilt` marks rows in which a camera was flagged; `copy`
+    marks rows that repeat another row of their star to the last bit, which are not used, and `repeated` rows with the
+    counts of another star or setting. `star` numbers the stars from 0; `sky` [electron] is the level that was
+    subtracted (None: not stated); `rotator` [deg] is NaN for results in the instrument frame, `time` [MJD, d] NaN where
+    it is not known. `remarks` name oddities of the table, and unused columns; `doubts` concern the whole catalogue,
+    whose results are then not to be trusted.
     """
 
     points: FieldPoints
-    teff_err: OfRows
-    counts: Counts
-    sigma: Counts
-    spoilt: Chosen
-    copy: Chosen
-    repeated: Chosen
-    star: Numbers
-    rotator: OfRows
-    time: OfRows
+    teff_err: Vector
+    counts: CountsOfRows
+    sigma: CountsOfRows
+    spoilt: ChosenRows
+    copy: ChosenRows
+    repeated: ChosenRows
+    star: RowNumbers
+    rotator: Vector
+    time: Vector
     remarks: tuple[str, ...] = ()
-    sky: Counts | None = None
+    sky: CountsOfRows | None = None
     doubts: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.star)
 
-    def of_rows(self, keep: Chosen) -> Catalogue:
+    def of_rows(self, keep: ChosenRows) -> Catalogue:
         """Some of the rows; stars are numbered anew."""
         if keep.all():
             return self
@@ -156,7 +155,7 @@ CARRIED = ("RA", "DEC", "BLENDED", "ID_FLAG", *user_tables.OF_STARS)
 """Columns that are about the stars, and go through as they are."""
 
 
-def _with_colours(source: InputTable, points: FieldPoints, place: Place) -> tuple[FieldPoints, OfRows]:
+def _with_colours(source: InputTable, points: FieldPoints, place: Place) -> tuple[FieldPoints, Vector]:
     """Field points with the temperatures that BP_RP gives where there is no TEFF, and the errors of all of them (K)."""
     source.used.update(set(CARRIED) & set(source.names))
     source.lacking.update({"SOURCE_ID"} - set(source.names))
@@ -227,7 +226,7 @@ def _bit(text: str, name: str, place: Place) -> bool:
 _NO_ID = (*MISSING, "-1", "unknown")
 
 
-def _stars(source: InputTable, points: FieldPoints, place: Place) -> Numbers:
+def _stars(source: InputTable, points: FieldPoints, place: Place) -> RowNumbers:
     """Number of the star of every row: by FILTER, and ID, SOURCE_ID or position; a row without is a star of its own."""
     rows = np.arange(source.rows)
     named = next((name for name in ("ID", "SOURCE_ID") if name in source.names), "ID")
@@ -257,7 +256,7 @@ def _stars(source: InputTable, points: FieldPoints, place: Place) -> Numbers:
     return _numbered(name, missing | unknown, points)
 
 
-def _numbered(name: Numbers, alone: Chosen, points: FieldPoints) -> Numbers:
+def _numbered(name: RowNumbers, alone: ChosenRows, points: FieldPoints) -> RowNumbers:
     """Numbers of stars by their name and filter; rows that are `alone` have each a number of their own."""
     band = np.unique(points.settings.filter, return_inverse=True)[1].reshape(-1)
     key = name * (band.max() + 1) + band
@@ -265,7 +264,7 @@ def _numbered(name: Numbers, alone: Chosen, points: FieldPoints) -> Numbers:
     return np.unique(np.where(alone, single, key), return_inverse=True)[1].reshape(-1)
 
 
-def _by_position(source: InputTable, points: FieldPoints) -> Numbers:
+def _by_position(source: InputTable, points: FieldPoints) -> RowNumbers:
     """Numbers of stars by RA and DEC: rows within `SAME_PLACE` that are not of one exposure are one star."""
     ra, dec = user_tables.sky_positions(source)
     time = user_tables.numeric_column(source, "MJD", Column("float", "d", missing=np.nan))
@@ -293,11 +292,11 @@ def _copies(
     source: InputTable,
     instrument: Instrument,
     points: FieldPoints,
-    counts: Counts,
-    sigma: Counts,
-    rotator: OfRows,
-    star: Numbers,
-) -> tuple[Chosen, Chosen]:
+    counts: CountsOfRows,
+    sigma: CountsOfRows,
+    rotator: Vector,
+    star: RowNumbers,
+) -> tuple[ChosenRows, ChosenRows]:
     """Rows that repeat one of their star, and rows with the position and counts of another star or setting.
 
     Noise does not repeat to the digits of a float32 in two cameras or more: such rows are one measurement, that with

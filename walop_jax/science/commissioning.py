@@ -22,7 +22,7 @@ def requirements(
 
     The accuracy of a fit that is not trusted is not known: nothing is required of it.
     """
-    blocking = [doubt.sentence for doubt in verdict.against if doubt.blocking and doubt.sentence]
+    blocking = [doubt.sentence for doubt in verdict.doubts if doubt.blocking and doubt.sentence]
     judged = "trusted" if verdict.trusted else [*blocking, *verdict.warnings, "not trusted"][0]
     minimum = "the fit has reached its minimum", verdict.converged, message or "converged"
     explains = "the model explains the data", verdict.trusted, judged
@@ -93,16 +93,16 @@ class Certificate(Displayed):
     def against(self) -> tuple[Doubt, ...]:
         """The reasons that it holds: those of the verdict, and the failed checks that say more."""
         said = () if self.verdict.trusted else SAID_BY_THE_FIT
-        said += (MEASURED,) if any(doubt.off for doubt in self.verdict.against) else ()
+        said += (MEASURED,) if any(doubt.off for doubt in self.verdict.doubts) else ()
         failed = (check for check in self.failed if check.name not in said)
         checks = (
             Doubt(Quality(0), f"{check.name}: {check.found}", remedy=CURES.get(check.name, REMADE))
             for check in failed
         )
-        return (*self.verdict.against, *checks)
+        return (*self.verdict.doubts, *checks)
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Checks and requirements as plain data, the part `commissioning` of check.json."""
         return {
             "product": str(self.path),
             "go": self.go,

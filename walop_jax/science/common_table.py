@@ -27,10 +27,10 @@ from walop_jax.data.schema import Column
 from walop_jax.data.user_tables import InputTable, in_memory, numeric_column, read_input_table, sky_positions
 from walop_jax.io.errors import fail
 from walop_jax.io.plain_tables import astropy_table, faults_of_ucds
+from walop_jax.io.shapes import Vector
 from walop_jax.sky.directions import designations, galactic
 from walop_jax.sky.position_angles import sky_to_instrument
 
-Vector = Float[np.ndarray, " n"]
 Pairs = Float[np.ndarray, "n 2"]
 Covariances = Float[np.ndarray, "n 2 2"]
 

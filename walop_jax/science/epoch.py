@@ -39,7 +39,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.data.settings import Settings
 from walop_jax.fit.base_model import SKY_AND_STARS
 from walop_jax.fit.model_of_set import model_like
-from walop_jax.fit.refit import FitResult, fit, with_honest_errors
+from walop_jax.fit.refit import FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import NO_STRUCTURE, Doubt, Quality
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
@@ -52,8 +52,8 @@ from walop_jax.model.specification import Model
 from walop_jax.science.star_errors import determinant, joint_errors, statistics
 from walop_jax.sky.position_angles import sky_to_instrument
 
-Vector = Float[np.ndarray, " k"]
-Matrix = Float[np.ndarray, "k k"]
+CommonVector = Float[np.ndarray, " k"]
+CommonMatrix = Float[np.ndarray, "k k"]
 
 CHANCE = 0.01
 COPIES = 1e-12  # chance of so small a χ² from which two sets are taken for one
@@ -65,7 +65,7 @@ UNEXPLAINED = (
 STACK = "walop-jax stack RUN NEW.fits -o SURVEY dates the change and gives one calibration for all nights"
 _SHOWN = 8  # parameters
 SURE = 5.0  # standard errors
-_KNOWN = 1e-7  # share of the largest eigenvalue below which a direction was measured by neither
+_KNOWN = 1e-7  # fraction of the largest eigenvalue below which a direction was measured by neither
 _LEANS = 1e-4  # of the variances of both fits, below which both are the prior, and rounding differs
 
 
@@ -83,7 +83,8 @@ class MovedParameter:
 
 @dataclasses.dataclass(frozen=True)
 class LargestChange:
-    """The parameter whose change stands out most, `z` standard errors of it, of so many changes that were `asked` for.
+    """The parameter whose change stands out most, by `z` standard errors, among the `asked` changes that were asked
+    for.
 
     `alone` says that `size` is the change of this parameter with all others as they were. `p_value` is corrected for
     the number of changes.
@@ -149,7 +150,7 @@ class Epoch(Displayed):
 
     @property
     def verdict(self) -> str:
-        """The verdict in words."""
+        """The answer in words: unchanged, changed, or not known."""
         if self.fits is None:
             return "The new data are not explained"
         return "The old calibration still fits" if self.fits else "The instrument has changed"
@@ -182,7 +183,7 @@ class Epoch(Displayed):
         return f"off by {two_digits(errors['median'])} % (median; {most} % at most) if the new data are right"
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The comparison as plain data, the part `epoch` of check.json."""
         return {"verdict": self.verdict} | dataclasses.asdict(self)
 
     def to_table(self) -> Any:
@@ -234,7 +235,7 @@ def fit_like(old: Calibration, calset: CalibrationSet) -> FitResult:
     start = model.start.copy()
     for name in shared_parameters(old.model, model):
         start[model.index(name)] = old.values[old.model.index(name)]
-    result = with_honest_errors(fit(Likelihood.of(calset, model), start=start))
+    result = with_empirical_covariance(fit(Likelihood.of(calset, model), start=start))
     if not result.converged:
         raise RuntimeError(f"the fit of the new set did not converge: {result.minimum.message}")
     return result
@@ -329,11 +330,15 @@ def added_amplitudes(old: Model, new: Model) -> list[str]:
 
 
 def compared(
-    names: Sequence[str], change: Vector, covariance: Matrix, sigma: Vector, units: Sequence[str]
+    names: Sequence[str],
+    change: CommonVector,
+    covariance: CommonMatrix,
+    sigma: CommonVector,
+    units: Sequence[str],
 ) -> tuple[float, int, LargestChange]:
     """Δᵀ V⁻¹ Δ, the number of directions that were measured, and the largest change of a single parameter.
 
-    Every parameter counts by itself and as if nothing else had changed; those of `sigma` 0 are not known.
+    Every parameter is asked by itself and as if nothing else had changed; parameters with `sigma` 0 are not known.
     """
     measured = np.flatnonzero(sigma > 0)
     unit = sigma[measured]

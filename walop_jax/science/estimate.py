@@ -25,6 +25,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from walop_jax.io.shapes import ByRowAndCamera, RowIndex
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.model.cameras import Cameras
 
@@ -33,19 +34,17 @@ CONVERGED = 1e-13  # of the largest step in q, u, or 1e-9 σ
 SINGULAR = 1e-13  # determinant over squared mean of an information matrix
 _SETTLED = 1e-9
 
-Counts = Float[np.ndarray, "r k"]  # by row and camera
-Rows = Int[np.ndarray, " r"]
 Rows3 = Float[np.ndarray, "r 3"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """(q, u) of every star, NaN where its rows do not hold both.
+    """(q, u) of every star (s), NaN where its rows do not hold both.
 
-    `photon` is the covariance from the noise of the counts; `condition` the square root of the condition
-    number of the information (1: q and u equally well known); `chi2` and `dof` of the star's rows, `flux` F (in
-    counts of unpolarised light at unit throughput) of every camera and `gain` of every row:
-    δ(q, u) = −Σ gain · δ(model / F).
+    `photon` is the covariance from the noise of the counts; `condition` the square root of the condition number of the
+    information (1: q and u equally well known); `chi2` and `dof` belong to the rows of a star, `flux` F (in counts of
+    unpolarised light at unit throughput) to every row and camera, `gain` to every row: δ(q, u) = −Σ gain · δ(model /
+    F).
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -53,25 +52,25 @@ class Estimate:
     condition: Float[np.ndarray, " s"]
     chi2: Float[np.ndarray, " s"]
     dof: Int[np.ndarray, " s"]
-    flux: Counts
+    flux: ByRowAndCamera
     gain: Float[np.ndarray, "r 2 k"]
 
-    def relative(self, change: Counts) -> Counts:
+    def relative(self, change: ByRowAndCamera) -> ByRowAndCamera:
         """Changes of counts over the flux, δ(model / F); 0 where there is no light."""
         return np.nan_to_num(change) / np.where(self.flux > 0, self.flux, np.inf)
 
 
 def estimate(
     vectors: Float[np.ndarray, "r k 3"],
-    counts: Counts,
-    sigma: Counts,
-    star: Rows,
+    counts: ByRowAndCamera,
+    sigma: ByRowAndCamera,
+    star: RowIndex,
     cameras: Cameras | None = None,
 ) -> Estimate:
     """Stokes parameters of stars from rows of intensities.
 
     A row of two cameras holds one combination of q and u: such a star needs several settings, or is NaN. Where the
-    shares of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row.
+    fractions of the arms in the light are not known (`cameras.split`), each arm has a flux of its own in every row.
 
     `vectors` (row, camera, Stokes) are the analysis vectors in the frame that (q, u) are wanted in; counts that
     are not finite, or whose `sigma` is not finite and above 0, are not used. `star` numbers the stars from 0
@@ -112,7 +111,7 @@ def estimate(
 
 
 def calibration_shift(
-    gain: Float[np.ndarray, "r 2 k"], change: Float[np.ndarray, "r k m"], star: Rows
+    gain: Float[np.ndarray, "r 2 k"], change: Float[np.ndarray, "r k m"], star: RowIndex
 ) -> Float[np.ndarray, "s 2 m"]:
     """Shift of every star's (q, u) when the model counts per unit flux of its rows change by `change`.
 
@@ -156,7 +155,7 @@ def _inverse(
 
 
 def _start(
-    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Rows, first: Int[np.ndarray, " s"]
+    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: RowIndex, first: Int[np.ndarray, " s"]
 ) -> Float[np.ndarray, "s 2"]:
     """The exact minimum F (1, q, u) = G⁻¹ b for stars of one row, (0, 0) for the others."""
     start = np.zeros((len(first), 2))
@@ -172,7 +171,7 @@ def _start(
 
 
 def _minimise(
-    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: Rows, first: Int[np.ndarray, " s"]
+    gram: Float[np.ndarray, "r 3 3"], moment: Rows3, star: RowIndex, first: Int[np.ndarray, " s"]
 ) -> tuple[Float[np.ndarray, "s 2"], Bool[np.ndarray, " s"]]:
     """(q, u) of least χ², and for which stars the steps have settled at a flux above 0."""
     qu = _start(gram, moment, star, first)

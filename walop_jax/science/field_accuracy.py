@@ -1,4 +1,4 @@
-"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and mistakes that could hide.
+"""Accuracy of the degree of polarisation over the field of a calibration, its limits, and errors that could hide.
 
 Stars with p ≤ 5 % at any angle, without photon noise. An error δm of the instrument matrix makes
 δ(q, u) = −M⁻¹ (δm₁ + δM (q, u)), hence its variance along the polarisation, averaged over the stars, is the error of p.
@@ -20,7 +20,7 @@ from walop_jax.calibration.accuracy import (
     SHARE,
     SIZE,
     TOLERANCE,
-    judged,
+    field_measured,
     measures_u,
     p_errors,
     p_forms,
@@ -37,7 +37,7 @@ from walop_jax.likelihood.inverses import whitening
 
 COARSE = 8  # the same where the question is what limits it
 FEW_STARS = 20
-NEXT_HIDDEN = 2  # mistakes that could hide, told beside the worst
+NEXT_HIDDEN = 2  # undetected errors, told beside the worst
 
 GROUPS = {
     "throughput": "the relative throughput of the cameras",
@@ -56,13 +56,13 @@ GROUPS = {
 class FieldAccuracy:
     """Standard error of p (a fraction) over the field, from the calibration alone: rms over stars with p ≤ 5 %.
 
-    `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A
-    mistake that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
+    `extent` is left, right, bottom and top in degrees. `limited_by` is what most of the error comes from. A systematic
+    error that the data would not have shown, the worst of them `hidden_by`, can make q or u wrong by `hidden`, the
     median over the field (NaN: not computed), at its just undetected size, `hidden_worst` where it is largest; `remedy`
-    is the measurement that would show it; `next_hidden` are those that follow. `not_measured` are the mistakes on which
-    the data hold no information.
-    `without_u` is the share of the field where a single exposure carries almost no information on u, `with_u` says
-    where it does (None: everywhere). `goal` is what p of a star is wanted to: the calibration may make half of it.
+    is the measurement that would show it; `next_hidden` are those that follow. `not_measured` are the errors on which
+    the data hold no information. `without_u` is the fraction of the field where a single exposure carries almost no
+    information on u, `with_u` says where it does (None: everywhere). `goal` is what p of a star is wanted to: the
+    calibration may make half of it.
     """
 
     error: Float[np.ndarray, "y x"]
@@ -82,17 +82,17 @@ class FieldAccuracy:
 
     @property
     def reached(self) -> float:
-        """The error of p that `SHARE` of the field stays below, of that where one exposure measures u."""
+        """The error of p that the fraction `SHARE` stays below, of the field where one exposure measures u."""
         return reached(self.error if self.with_u is None else self.error[self.with_u])
 
     @property
-    def judged(self) -> str:
+    def field_measured(self) -> str:
         """The part of the field of which `reached` is the error, in words."""
-        return judged(self.without_u)
+        return field_measured(self.without_u)
 
     @property
     def share(self) -> float:
-        """Share of the field in which the error is below the goal."""
+        """Fraction of the field in which the error is below the goal."""
         return float(np.mean(self.error < self.goal))
 
     @property
@@ -112,7 +112,7 @@ class FieldAccuracy:
             advice = f"observe {strip} with the plate at 22.5° as well"
         if np.isnan(self.reached):
             advice = "no single exposure measures both q and u: observe with the plate at 22.5° as well"
-        asked.append(_p_known(self.reached, allowed, self.judged, advice, needed=False))
+        asked.append(_p_known(self.reached, allowed, self.field_measured, advice, needed=False))
         if self.hidden > 0:
             what = f"no error above {two_digits(100 * self.goal)} % goes undetected: {self.hidden_by}"
             size, _ = beside(100 * self.hidden, 100 * self.goal)
@@ -138,7 +138,7 @@ class FieldAccuracy:
 
     @property
     def median(self) -> float:
-        """Median over the field."""
+        """Median over the field of the error of p, a fraction."""
         return float(np.median(self.error))
 
     def document(self) -> dict[str, object]:
@@ -152,11 +152,11 @@ class FieldAccuracy:
         }  # fmt: skip
 
     def facts(self, *, complete: bool = True) -> tuple[tuple[str, str], ...]:
-        """The answer in a few lines: accuracy, its limits, mistakes that could hide; of a `complete` model or not."""
+        """The answer in a few lines: accuracy, its limits, errors that could hide; of a `complete` model or not."""
         if not self.trusted:
             return (("p of a star", "not known: the calibration is not trusted"),)
         apart = " behind the telescope" if self.not_measured else ""
-        if not all(mistake.ahead for mistake in self.not_measured):
+        if not all(each.ahead for each in self.not_measured):
             apart = " apart from quantities not measured"
         goal, lacks = f"{100 * self.goal:.3g} %", self.shortfalls
         median_error = f"{per_cent(self.median)} %{apart} (median error for p ≤ 5 %)"
@@ -165,7 +165,10 @@ class FieldAccuracy:
         if complete:
             no = f"no, for {len(lacks)} reason{'s' if len(lacks) > 1 else ''} above"
             lines.append(
-                (f"good for {goal}", no if lacks else f"yes: {per_cent(self.reached)} % in {self.judged}")
+                (
+                    f"good for {goal}",
+                    no if lacks else f"yes: {per_cent(self.reached)} % in {self.field_measured}",
+                )
             )
         if self.limited_by:
             lines.append(("limited by", self.limited_by))
@@ -180,7 +183,7 @@ class FieldAccuracy:
 
     @property
     def further_facts(self) -> tuple[tuple[str, str], ...]:
-        """The mistakes that could hide beside the worst one, each with its effect on stars and what would show it."""
+        """The errors that could hide beside the worst one, each with its effect on stars and what would show it."""
         lines = (
             f"{entry.in_words}: {off_by(*entry.error)}{f'; {entry.remedy}' if entry.remedy else ''}"
             for entry in self.next_hidden
@@ -204,7 +207,7 @@ class Requirement:
 
     @property
     def doubt(self) -> Doubt:
-        """The reason that it is where it is not met."""
+        """The doubt that it is if it is not met."""
         return Doubt(Quality(0), self.found, blocking=self.needed, off=self.off, remedy=self.advice)
 
 
@@ -244,11 +247,11 @@ def for_stars(
     *,
     complete: bool = True,
 ) -> Verdict:
-    """The verdict on a calibration for stars: that on its fit, with what it lacks for their accuracy.
+    """The verdict on a calibration for stars: the verdict on its fit, with what it lacks for their accuracy.
 
-    `accuracy` is that of p over the field (None: not asked), `findings` are those of `inspect` about its data. The
-    accuracy of a fit that is not trusted, or not `complete`, is not known: it is no reason for anything. Notes are none
-    either.
+    `accuracy` is the accuracy of p over the field (None: not asked), `findings` are the findings of `inspect` about its
+    data. The accuracy of a fit that is not trusted, or not `complete`, is not known, and no reason for anything; nor
+    are notes.
     """
     doubts = [
         Doubt(Quality(0), finding.what, blocking=finding.severity == "fault", remedy=finding.advice)
@@ -262,8 +265,8 @@ def for_stars(
         doubts = [*(need.doubt for need in needs if not need.met), *doubts]
     if verdict.trusted and accuracy.not_measured:  # said with its size
         said = NOT_MEASURED.partition("{")[0]
-        kept = tuple(doubt for doubt in verdict.against if not doubt.sentence.startswith(said))
-        verdict = dataclasses.replace(verdict, against=kept)
+        kept = tuple(doubt for doubt in verdict.doubts if not doubt.sentence.startswith(said))
+        verdict = dataclasses.replace(verdict, doubts=kept)
     return verdict.with_doubts(doubts, stars=dict(accuracy.facts(complete=complete))["p of a star"])
 
 
@@ -283,8 +286,8 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
     matrix, covariance, slopes = calibration.over_field(x, y, settings, NODES, TOLERANCE)
     error = p_errors(matrix[: size**2], covariance[: size**2]).reshape(size, size)
     with_u = measures_u(matrix[: size**2].reshape(-1, 2, 3)).reshape(size, size)
-    mistakes = could_hide(calibration)
-    worst = mistakes[0] if mistakes else None
+    undetected = could_hide(calibration)
+    worst = undetected[0] if undetected else None
     nothing = np.nan if calibration.hidden is None else 0.0
     return FieldAccuracy(
         error,
@@ -295,12 +298,12 @@ def field_accuracy(calibration: Calibration, size: int = SIZE, goal: float = GOA
         hidden_by="" if worst is None else worst.in_words,
         hidden_worst=nothing if worst is None else worst.error[1],
         remedy="" if worst is None else worst.remedy,
-        not_measured=tuple(mistake for mistake in mistakes if not mistake.measured),
+        not_measured=tuple(each for each in undetected if not each.measured),
         trusted=calibration.verdict.trusted,
         without_u=float(np.mean(~with_u)),
         with_u=with_u,
         goal=goal,
-        next_hidden=mistakes[1 : 1 + NEXT_HIDDEN],
+        next_hidden=undetected[1 : 1 + NEXT_HIDDEN],
     )
 
 

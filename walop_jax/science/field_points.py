@@ -72,12 +72,12 @@ def field_points(
 ) -> FieldPoints:
     """The X, Y and optional settings of a table of field points of an instrument.
 
-    A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without the latter it is in the beam where it has an
-    angle. `<P>_TURN` (absent: 0) is by how much it turns during the exposure, about that angle. Of column prefixes,
-    those `always_in` must have an angle, and those `never_in`, in the beam in no exposure of the calibration, are in it
-    only where `<P>_IN` says so. Single points outside the field are marked; if most of them lie outside, the unit must
-    be wrong. Unless a place is needed `everywhere`, points without one are marked as well, with a remark.
-    `filters` are names that are known, in whose spelling FILTER is returned.
+    A moving element has the columns `<P>_ANGLE` and `<P>_IN`; without `<P>_IN` it is in the beam where it has an angle.
+    `<P>_TURN` (absent: 0) is by how much it turns during the exposure, about that angle. Elements whose prefix is in
+    `always_in` must have an angle; elements in `never_in`, which were in the beam in no exposure of the calibration,
+    are in the beam only where `<P>_IN` says so. Single points outside the field are marked; if most points lie outside,
+    the unit must be wrong. Points without a position are an error if a position is needed `everywhere`; otherwise they
+    are marked as well, with a remark. `filters` are names that are known, in whose spelling FILTER is returned.
 
     Raises `DataError` naming file, column and row for anything that cannot be meant.
     """

@@ -32,11 +32,11 @@ DIGITS = 1e-3  # to which cameras agree on a number of a star
 BESIDE_WCS = (5.0 / 3600.0, 0.1)
 """Distance and angle (deg) from which on a pointing contradicts the WCS of an image."""
 FARTHEST = 1.0  # deg: the median star of the field is nearer to its centre
-Columns = dict[str, tuple[np.ndarray, str, str]]  # values, unit and description of columns by name
+CatalogueColumns = dict[str, tuple[np.ndarray, str, str]]  # values, unit and description of columns by name
 Catalogues = Sequence[CameraCatalogue]
-Places = Sequence[Float[np.ndarray, "_ 2"]]
+SkyPositions = Sequence[Float[np.ndarray, "_ 2"]]
 Chosen = Bool[np.ndarray, "s k"]
-Found = Int[np.ndarray, "s k"]
+MatchedRows = Int[np.ndarray, "s k"]
 OnSky = Float[np.ndarray, "s 2"]
 
 
@@ -48,7 +48,7 @@ class Gathered:
     star.
     """
 
-    columns: Columns
+    columns: CatalogueColumns
     pointing: Pointing
     registrations: tuple[Registration, ...]
     matched: Int[np.ndarray, " n"]
@@ -56,10 +56,10 @@ class Gathered:
 
 
 def pointing_of(catalogues: Catalogues, given: dict[str, float | None]) -> tuple[Pointing, list[str]]:
-    """The pointing, as given, of the headers, or of the WCS of an image, with remarks.
+    """The pointing, as given, or from the headers, or from the WCS of an image; with remarks.
 
-    One that contradicts the WCS beside it is remarked on. Raises `DataError` where it is nowhere, for headers that
-    contradict each other, and for angles (deg) that cannot be meant.
+    A pointing that contradicts the WCS beside it is remarked on. Raises `DataError` where there is none, for headers
+    that contradict each other, and for angles (deg) that cannot be meant.
     """
     first, remarks = catalogues[0], []
     needed = [name for name, value in given.items() if value is None]
@@ -151,9 +151,9 @@ def instrument_of(catalogues: Catalogues, asked: str) -> tuple[str, list[str]]:
 def gather(
     catalogues: Catalogues, names: Sequence[str], pointing: Pointing, tolerance: float = 1.0
 ) -> Gathered:
-    """One catalogue of the stars of all cameras; `names` are those of the cameras, `tolerance` is in arcsec.
+    """One catalogue of the stars of all cameras; `names` are the names of the cameras, `tolerance` is in arcsec.
 
-    Raises `DataError` for catalogues of different fields, and for those that have too few stars in common.
+    Raises `DataError` for catalogues of different fields, and for catalogues with too few stars in common.
     """
     if len(fluxes := {camera.flux_name: camera for camera in catalogues}) > 1:
         what = " and ".join(f"{name} ({camera.path})" for name, camera in fluxes.items())
@@ -203,7 +203,9 @@ def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, 
     return place
 
 
-def _registrations(catalogues: Catalogues, places: Places, tolerance: float) -> tuple[Registration, ...]:
+def _registrations(
+    catalogues: Catalogues, places: SkyPositions, tolerance: float
+) -> tuple[Registration, ...]:
     """Shift and rotation of each camera, against the median of all."""
     first, moves = catalogues[0], [directions.NOT_MOVED]
     for camera, place in zip(catalogues[1:], places[1:], strict=True):
@@ -235,7 +237,7 @@ def _about_moves(moves: Sequence[Registration], names: Sequence[str], tolerance:
     ]
 
 
-def _matched(places: Places, tolerance: float) -> tuple[Found, Chosen, OnSky]:
+def _matched(places: SkyPositions, tolerance: float) -> tuple[MatchedRows, Chosen, OnSky]:
     """The row of each star in every camera (-1: none), where that is ambiguous, and the mean position.
 
     The camera with the most stars begins; stars that only others see are added.
@@ -269,7 +271,7 @@ def _check_common(catalogues: Catalogues, seen: Chosen, tolerance: float) -> Non
             raise fail(f"{what} within {tolerance:g} arcsec", file=catalogue.path, advice=advice)
 
 
-def _check_distinct(catalogues: Catalogues, index: Found) -> None:
+def _check_distinct(catalogues: Catalogues, index: MatchedRows) -> None:
     """Refuse a camera with the fluxes of another one: noise does not repeat."""
     for first, second in itertools.combinations(range(len(catalogues)), 2):
         both = index[(index[:, [first, second]] >= 0).all(axis=1)]
@@ -281,15 +283,15 @@ def _check_distinct(catalogues: Catalogues, index: Found) -> None:
 
 
 def _columns(
-    catalogues: Catalogues, pointing: Pointing, index: Found, ambiguous: Chosen, place: OnSky
-) -> tuple[Columns, list[str]]:
+    catalogues: Catalogues, pointing: Pointing, index: MatchedRows, ambiguous: Chosen, place: OnSky
+) -> tuple[CatalogueColumns, list[str]]:
     def of_cameras(values: Sequence[np.ndarray], missing: Any) -> np.ndarray:
         of_each = zip(index.T, values, strict=True)
         return np.stack([np.where(row >= 0, column[row], missing) for row, column in of_each], axis=1)
 
     ra, dec = pointing.sky_of(*place.T)
     flag = of_cameras([camera.flag for camera in catalogues], 0) | np.where(ambiguous, BLEND, 0)
-    columns: Columns = {
+    columns: CatalogueColumns = {
         "RA": (ra, "deg", "right ascension, ICRS"),
         "DEC": (dec, "deg", "declination, ICRS"),
         "X": (place[:, 0], "deg", "field coordinate"),

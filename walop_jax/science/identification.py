@@ -58,10 +58,12 @@ class _Pairs(NamedTuple):
 
 
 def identified(made: Gathered, table: Any, tolerance: float) -> Gathered:
-    """The same with the columns of a table of known stars (RA, DEC and any of `OF_STARS`) that are matched with them.
+    """The gathered catalogue with columns of a table of known stars (RA, DEC and any of `OF_STARS`), matched with its
+    stars.
 
-    `table` is a path, an astropy table, or columns by name. With PMRA, PMDEC (mas/yr) and REF_EPOCH (yr) its places are
-    moved to the MJD of the exposure. Positions are registered, as between cameras. ID_FLAG says how a star was found.
+    `table` is a path, an astropy table, or columns by name. With PMRA, PMDEC (mas/yr) and REF_EPOCH (yr) its positions
+    are moved to the MJD of the exposure. Positions are registered, as between cameras. ID_FLAG says how a star was
+    found.
     """
     read = isinstance(table, str | os.PathLike)
     source = user_tables.read_input_table(table, ("RA", "DEC")) if read else user_tables.in_memory(table)

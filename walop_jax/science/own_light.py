@@ -34,6 +34,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize, special
 
+from walop_jax.io.shapes import OfStars
 from walop_jax.io.text import some, with_error
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import instrument_changes as alarms
@@ -58,8 +59,7 @@ _SURELY = 4.0  # of −2 ln L, two standard deviations
 _SLOPES = (1.5, 2.5, 3.5, 4.5)  # … and the exponents β of its variance that are tried
 _MOST_GROUPS = 20  # exposure groups with a mean of their own
 
-OfStars = Float[np.ndarray, " s"]
-Columns = Float[np.ndarray, "s 2 c"]
+ResponseColumns = Float[np.ndarray, "s 2 c"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class OwnLight:
     x: OfStars
     y: OfStars
     group: Int[np.ndarray, " s"]
-    questions: Columns
+    questions: ResponseColumns
     nuisances: Float[np.ndarray, "s 2 n"]
 
     @classmethod
@@ -83,12 +83,12 @@ class OwnLight:
         return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)))
 
     def of(self, chosen: Bool[np.ndarray, " s"]) -> OwnLight:
-        """Some of the stars."""
+        """The records of some of the stars."""
         return OwnLight(*(getattr(self, f.name)[chosen] for f in dataclasses.fields(self)))
 
 
 class ArmChange(NamedTuple):
-    """A change of the balance of an arm: the share by which its first camera is brighter against the second.
+    """A change of the balance of an arm: the fraction by which its first camera is brighter against the second.
 
     `error` is inf where the stars hold nothing on it; `chance` is that of a size as large without the change.
     """
@@ -104,7 +104,7 @@ class ArmChange(NamedTuple):
         return float(np.copysign(alarms.threshold(max(self.chance, 1e-300)), self.size))
 
     def words(self) -> str:
-        """The change in words."""
+        """The change in words: which camera is brighter, by how much, and how sure that is."""
         first, second = self.cameras
         size = with_error(100 * abs(self.size), 100 * self.error)
         return f"{first} {('brighter', 'fainter')[self.size < 0]} by {size} % against {second}"
@@ -148,7 +148,7 @@ class OwnLightCheck:
         return f"{what}, {abs(best.sigma):.0f} σ: as if {some([c.words() for c in self.alike], 4, ' or ')}"
 
     def document(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """The check as plain data."""
         return {
             "found": self.found,
             "stars": self.stars,
@@ -167,7 +167,7 @@ class Unpolarised(NamedTuple):
 
     qu: Float[np.ndarray, "s 2"]
     noise: Float[np.ndarray, "s 2 2"]
-    shifts: Columns
+    shifts: ResponseColumns
 
 
 def unpolarised(
@@ -233,7 +233,7 @@ class _Fitted(NamedTuple):
     used: Bool[np.ndarray, " s"]
     qu: Float[np.ndarray, "s 2"]
     left: Float[np.ndarray, "s 2"]
-    questions: Columns
+    questions: ResponseColumns
     base: Float[np.ndarray, "s 2 m"]
     root: Float[np.ndarray, "m m"]
     scatter: float

@@ -25,7 +25,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-Vector = Float[np.ndarray, " s"]
+from walop_jax.io.shapes import OfStars
+
 ESTIMATORS = ("MAS", "WK")
 _CERTAIN, _ANGLES, _TOGETHER = 5.0, 128, 4096  # σ from which C alone counts; angles, and stars at once
 NO_ANGLE = 180.0 / np.sqrt(12.0)  # standard deviation (deg) of an angle of which nothing is known
@@ -34,11 +35,11 @@ NO_ANGLE = 180.0 / np.sqrt(12.0)  # standard deviation (deg) of an angle of whic
 class Polarisation(NamedTuple):
     """Degree of polarisation, debiased degree, its error; angle and error in degrees, 0 ≤ EVPA < 180."""
 
-    degree: Vector
-    debiased: Vector
-    degree_error: Vector
-    angle: Vector
-    angle_error: Vector
+    degree: OfStars
+    debiased: OfStars
+    degree_error: OfStars
+    angle: OfStars
+    angle_error: OfStars
 
 
 def polarisation(
@@ -70,7 +71,7 @@ def polarisation(
     return Polarisation(p, debiased, np.sqrt(np.maximum(along, 0.0)), angle, error)
 
 
-def _spread_of_angles(qu: Float[np.ndarray, "s 2"], covariance: Float[np.ndarray, "s 2 2"]) -> Vector:
+def _spread_of_angles(qu: Float[np.ndarray, "s 2"], covariance: Float[np.ndarray, "s 2 2"]) -> OfStars:
     """The rms distance (deg, within half a turn) of the angles of normal distributions from that of their means."""
     root = np.linalg.cholesky(covariance)
     mean = np.linalg.solve(root, qu[..., None])[..., 0]

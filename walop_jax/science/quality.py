@@ -41,7 +41,7 @@ from walop_jax.science.field_accuracy import field_accuracy
 from walop_jax.sky.nights import night_of
 
 POLARISED = 0.005  # catalogued p from which a standard shows angle and p, and below which it shows the zero
-HELD = 1e-3  # share of the information of the catalogue that the data must add to a star
+HELD = 1e-3  # fraction of the information of the catalogue that the data must add to a star
 BEYOND = 2.0  # standard errors beyond a limit
 
 ERRORS = {"ANGLE": "ANGLE_ERR", "P_RATIO": "P_RATIO_ERR", "ZERO_Q": "ZERO_ERR", "ZERO_U": "ZERO_ERR"}
@@ -95,12 +95,12 @@ class Standard(NamedTuple):
 
     @property
     def difference(self) -> Float[np.ndarray, " 2"]:
-        """Measured less catalogue."""
+        """Measured q, u less the catalogue values."""
         return self.measured - self.catalogue
 
     @property
     def total(self) -> Float[np.ndarray, "2 2"]:
-        """Covariance of the difference."""
+        """Covariance (2, 2) of the difference: of the measurement and of the catalogue."""
         return self.covariance + np.diag(self.variance)
 
 
@@ -134,7 +134,7 @@ def _mean(measured: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def numbers_of(stars: Sequence[Standard]) -> dict[str, float]:
-    """Quality numbers of standards."""
+    """The quality numbers that standards give, by column."""
     polarised = [star for star in stars if np.hypot(*star.catalogue) >= POLARISED]
     zeros = [star for star in stars if np.hypot(*star.catalogue) < POLARISED]
     angle, ratio = [], []

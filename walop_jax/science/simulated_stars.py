@@ -17,7 +17,7 @@ from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.science.colours import DWARFS, GIANTS, LIMITS, temperature
-from walop_jax.science.gathering import Columns
+from walop_jax.science.gathering import CatalogueColumns
 from walop_jax.simulation.observing_plan import ObservingPlan
 from walop_jax.simulation.simulate import PhotonNoise
 from walop_jax.sky.directions import Pointing
@@ -36,7 +36,7 @@ _POSITION_ERROR = 0.05  # arcsec, of a camera
 class SimulatedStars:
     """Columns of a catalogue (files: catalogues), and the truth: q, u on the sky of each star, and TEFF (K)."""
 
-    columns: Columns
+    columns: CatalogueColumns
     qu: Float[np.ndarray, "n 2"]
     teff: Float[np.ndarray, " n"]
 
@@ -44,7 +44,7 @@ class SimulatedStars:
         """The truth as plain data."""
         return {"q": self.qu[:, 0].tolist(), "u": self.qu[:, 1].tolist(), "teff": self.teff.tolist()}
 
-    def of_camera(self, number: int, seed: int) -> tuple[Columns, dict[str, Any]]:
+    def of_camera(self, number: int, seed: int) -> tuple[CatalogueColumns, dict[str, Any]]:
         """Columns of one camera, named as by SExtractor, in an order and with positions of its own; its header."""
         columns = {name: values for name, (values, *_) in self.columns.items()}
         draw = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(5, number)))
@@ -53,7 +53,7 @@ class SimulatedStars:
         header = {"RA": POINTING.ra, "DEC": POINTING.dec, "ROTATOR": POINTING.rotator}
         header |= {name: columns[name][0].item() for name in ("FILTER", "MJD")}
         dec = columns["DEC"][rows]
-        made: Columns = {
+        made: CatalogueColumns = {
             "ALPHA_J2000": (columns["RA"][rows] + off_ra / np.cos(np.deg2rad(dec)), "deg", "right ascension"),
             "DELTA_J2000": (dec + off_dec, "deg", "declination"),
             "FLUX_AUTO": (columns["N"][rows, number], "count", "flux"),
@@ -105,7 +105,7 @@ def simulated_stars(
         expected = np.asarray(detected(*map(array, (expected, x, y))))
     noise = PhotonNoise(plan.read_noise)
     counts, sigma = (expected, noise.sigma(expected)) if noiseless else noise.draw(photons, expected)
-    columns: Columns = {
+    columns: CatalogueColumns = {
         "SOURCE_ID": (np.arange(count) + 1_000_000, "", "identifier of the star"),
         "RA": (ra, "deg", "right ascension, ICRS"),
         "DEC": (dec, "deg", "declination, ICRS"),

@@ -16,19 +16,19 @@ from jaxtyping import Bool, Float
 from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.settings import Settings
+from walop_jax.io.shapes import OfPoints
 from walop_jax.science.estimate import estimate
 
 QUANTITIES = ("q", "u", "p")
 _ELECTRONS = 1e6  # of the stars; their photon noise does not enter
 
-Vectors = Float[np.ndarray, "p *r k 3"]
+RowVectors = Float[np.ndarray, "p *r k 3"]
 """Analysis vectors at field points, of one exposure or of several (r) in which a star is seen."""
 QuPairs = Float[np.ndarray, "n 2"]
-Places = Float[np.ndarray, " p"]  # at field points
 CameraPairs = tuple[tuple[int, int], ...]
 
 
-def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k"]:
+def transmitted(vectors: RowVectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k"]:
     """Counts (point, star, camera) of sources of unit flux."""
     s = np.concatenate([np.ones((len(stars), 1)), stars], axis=1)
     return np.einsum("p...ks,ns->pn...k", vectors, s)
@@ -37,8 +37,8 @@ def transmitted(vectors: Vectors, stars: QuPairs) -> Float[np.ndarray, "p n *r k
 class Truth(NamedTuple):
     """True instrument matrices (m21, m22, …) at field positions (deg), for the colour of the polariser's source."""
 
-    x: Places
-    y: Places
+    x: OfPoints
+    y: OfPoints
     matrix: Float[np.ndarray, "p m"]
 
 
@@ -51,7 +51,7 @@ def star_errors(found: Float[np.ndarray, "p n 2"], stars: Float[np.ndarray, "n 2
     return np.sqrt(np.stack([*np.mean((found - stars) ** 2, axis=1).T, np.mean(degree**2, axis=1)], axis=1))
 
 
-def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
+def joint_errors(vectors: RowVectors, reference: RowVectors, stars: Float[np.ndarray, "n 2"]) -> Errors:
     """Errors of stars seen through `reference` and recovered, noise-free, with the vectors of a calibration."""
     counts = _ELECTRONS * transmitted(reference, stars)
     p, n, cameras = *counts.shape[:2], counts.shape[-1]
@@ -62,7 +62,7 @@ def joint_errors(vectors: Vectors, reference: Vectors, stars: Float[np.ndarray, 
 
 
 def promised_errors(
-    analysis: AnalysisVectors, setting: Settings, x: Places, y: Places, stars: Float[np.ndarray, "n 2"]
+    analysis: AnalysisVectors, setting: Settings, x: OfPoints, y: OfPoints, stars: Float[np.ndarray, "n 2"]
 ) -> Errors:
     """Errors that the calibration promises, by its covariance and the structure of field points; rms over the stars."""
     vectors = analysis.coloured(setting, x, y)
@@ -87,7 +87,9 @@ def promised_errors(
     return np.sqrt(total / n)
 
 
-def plate_errors(analysis: AnalysisVectors, settings: Sequence[Settings], x: Places, y: Places) -> Places:
+def plate_errors(
+    analysis: AnalysisVectors, settings: Sequence[Settings], x: OfPoints, y: OfPoints
+) -> OfPoints:
     """Photon error of (q, u) in the worse direction for an unpolarised star seen once through each setting.
 
     In units of the error of q that an ideal instrument would have with the same light: 1 for a single exposure of
@@ -104,7 +106,7 @@ def plate_errors(analysis: AnalysisVectors, settings: Sequence[Settings], x: Pla
     return worst / np.sqrt(2.0 / counts.sum(axis=(1, 2)))
 
 
-def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Places:
+def determinant(vectors: RowVectors, pairs: CameraPairs | None = None) -> OfPoints:
     """Information of the exposures on (q, u) at every point: |m22 m33 − m23 m32| for one exposure of two arms.
 
     In general the root of det MᵀM, M having a row (m22, m23) for every arm and exposure: 0 where all see the same
@@ -115,12 +117,12 @@ def determinant(vectors: Vectors, pairs: CameraPairs | None = None) -> Places:
     return np.sqrt(np.maximum(np.linalg.det(rows.swapaxes(1, 2) @ rows), 0.0))
 
 
-def _two_by_two(vectors: Vectors) -> CameraPairs:
+def _two_by_two(vectors: RowVectors) -> CameraPairs:
     return tuple((k, k + 1) for k in range(0, vectors.shape[-2], 2))
 
 
 def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> dict[str, dict[str, float]]:
-    """Median, rms, 95 % and maximum over the field of each error in per cent; share of the field under 0.1 %."""
+    """Median, rms, 95 % and maximum over the field of each error in per cent; fraction of the field under 0.1 %."""
     numbers = {}
     for name, values in zip(QUANTITIES, (errors if chosen is None else errors[chosen]).T, strict=True):
         sizes = np.median(values), np.sqrt(np.mean(values**2)), np.quantile(values, 0.95), np.max(values)
@@ -134,8 +136,8 @@ def statistics(errors: Errors, chosen: Bool[np.ndarray, " p"] | None = None) -> 
 class MethodErrors:
     """Errors of both methods at some field points; `zone` marks |m22 m33 − m23 m32| < 0.1."""
 
-    x: Places
-    y: Places
+    x: OfPoints
+    y: OfPoints
     paper: Errors
     joint: Errors
     zone: Bool[np.ndarray, " p"]
@@ -150,7 +152,7 @@ class MethodErrors:
         return out
 
 
-def truth_vectors(joint: Vectors, matrix: Float[np.ndarray, "p m"]) -> Vectors:
+def truth_vectors(joint: RowVectors, matrix: Float[np.ndarray, "p m"]) -> RowVectors:
     """Analysis vectors with true matrices (m21, m22, …) and, what these do not hold, the sums of the joint model.
 
     a± = ½ (S ± S₀ m) with S the sum of a pair of cameras, which follow each other; an error of S is second order in p.

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import special
 
-from walop_jax.likelihood.flux import Sharing, project_flux
+from walop_jax.likelihood.flux import FluxGroups, project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.optics import through_series
 from walop_jax.science.catalogue import ANOTHER_PLACE
@@ -144,7 +144,7 @@ class StarResiduals:
         self, columns: Float[np.ndarray, "r k c"]
     ) -> tuple[Float[np.ndarray, "c r k"], Float[np.ndarray, "s 2 c"]]:
         """Columns without flux, and their products Tᵀ c with what q and u of a star do."""
-        free = project_flux(np.moveaxis(columns, -1, 0), self.model, False, Sharing(self.together))
+        free = project_flux(np.moveaxis(columns, -1, 0), self.model, False, FluxGroups(self.together))
         along = np.einsum("rik,crk->ric", self.tangent, free, optimize=True)
         return free, np.add.reduceat(along, self.first)
 

@@ -20,10 +20,10 @@ from walop_jax.science.polarisation import polarisation
 
 FEW = 0.5  # of the rows
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two
-Columns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
+StokesColumns = dict[str, tuple[np.ndarray, str, str]]  # values, description, unit
 
 
-def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> Columns:
+def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) -> StokesColumns:
     """Columns added to a catalogue (docs: files), of stars in all their rows; ValueError for an unknown `estimator`."""
     covariance = stars.covariance
     light = polarisation(stars.qu, covariance, estimator)
@@ -33,19 +33,19 @@ def stokes_columns(stars: Stars, star: Int[np.ndarray, " n"], estimator: str) ->
     def pair(end: str, values: Float[np.ndarray, "s 2"], about: str) -> dict[str, tuple[np.ndarray, str]]:
         return {f"{name}{end}": (values[:, k], about.format(name)) for k, name in enumerate("QU")}
 
-    hidden = "largest shift of {} by a mistake that calibration data would not show"
+    hidden = "largest shift of {} by a systematic error that calibration data would not show"
     columns = {
         "Q": (stars.qu[:, 0], "q of the star: on the sky where ROTATOR is given"),
         "U": (stars.qu[:, 1], "u of the star: on the sky where ROTATOR is given"),
         **pair("_ERR", error, "standard error of {}: photons, calibration, colour"),
         "QU_COV": (covariance[:, 0, 1], "covariance of Q and U"),
-        "QU_PHOTON": (stars.photon[:, 0, 1], "the share of the photons in QU_COV"),
+        "QU_PHOTON": (stars.photon[:, 0, 1], "the part of the photons in QU_COV"),
         "P": (light.degree, "degree of polarisation"),
         "P_DEBIASED": (light.debiased, f"degree of polarisation without its bias, {estimator}"),
         "P_ERR": (light.degree_error, "standard error of P"),
         "EVPA": (light.angle, "electric vector angle: north to east, or from +X"),
         "EVPA_ERR": (light.angle_error, "standard error of EVPA"),
-        **pair("_PHOTON", photon, "the share of the photons in {}_ERR"),
+        **pair("_PHOTON", photon, "the part of the photons in {}_ERR"),
         **pair("_COLOUR", stars.colour, "error of {} if TEFF is ignored"),
         **pair("_HIDDEN", stars.hidden, hidden),
         "CHI2": (stars.chi2, "chi squared of the rows of the star"),

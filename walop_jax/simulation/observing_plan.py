@@ -249,7 +249,7 @@ class ObservingPlan:
 
     @classmethod
     def usual(cls, instrument: Instrument) -> ObservingPlan:
-        """The plan of an instrument that goes without saying: where field points lie on a line there is no sky."""
+        """The usual plan for an instrument; without sky where its field points lie on a line, as on a bench."""
         return cls(instrument, **(NO_SKY if instrument.raster[0] == "line" else {}))
 
     @functools.cached_property
@@ -335,7 +335,9 @@ class ObservingPlan:
         further = [dict(zip(self.moving, m, strict=True)) for m in itertools.product(*self.moving.values())]
         of_polariser: Any = () if self.design.polariser is None else self.polariser_angles
         angles = (*of_polariser, *[None] * self.lamps)
-        indoors = [dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)] or [
+        through_polariser = [
+            dataclasses.replace(stop, times=1) for stop in self.stops for _ in range(stop.times)
+        ] or [
             Stop(a, f, p, m, kind="lamp" if a is None else "clp")
             for f in self.filter_names
             for p in self.plate
@@ -360,7 +362,7 @@ class ObservingPlan:
             name, plate = self.filter_names[0], plates[0]
             field = Stop(None, name, plate, further[0], kind="standard", number=self.standards)
             sky += [field] * self.zero_exposures
-        return (*indoors, *sky)
+        return (*through_polariser, *sky)
 
     def exposures(self) -> Exposures:
         """All exposures in the order in which they are taken."""
@@ -422,7 +424,7 @@ class ObservingPlan:
         return used, np.where(used, star, -1)
 
     def context(self) -> Context:
-        """The facts that effects which grow with the data need."""
+        """What effects that grow with the data need to know of the run."""
         return effect_context(self.design, self.exposures())._replace(sources=self.star_names)
 
 
@@ -504,7 +506,7 @@ def read_plan(path: PathLike, instrument: PathLike | None = None) -> ObservingPl
 def plan_of(
     content: dict[str, Any], folder: Path, instrument: PathLike | Instrument | None = None
 ) -> ObservingPlan:
-    """The plan of the entries of a file in `folder`; the rest as `read_plan`."""
+    """The plan that the entries of a file in `folder` describe; `instrument` and errors as for `read_plan`."""
     content = dict(content)
     hints, of_stops, read = typing.get_type_hints(ObservingPlan), typing.get_type_hints(Stop), Reader("")
     check_names("entry of a plan", content, hints)
@@ -538,7 +540,7 @@ def plan_of_document(document: Mapping[str, Any], instrument: Instrument) -> Obs
 
 
 def instrument_named(content: Mapping[str, Any], folder: Path) -> str | Path | None:
-    """The instrument that a plan in `folder` names: that of the package, or the description file beside it."""
+    """The instrument that a plan in `folder` names: one of the package, or the description file beside it."""
     if (name := content.get("instrument")) is None:
         return None
     beside = folder / str(name)

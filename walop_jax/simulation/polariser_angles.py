@@ -1,4 +1,4 @@
-"""Angles of the calibration polariser: as a plan gives them, in Python or as a file, and evenly over a turn."""
+"""Angles of the calibration polariser: evenly over a turn, or as a plan states them, in Python or as a file."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 
 def polariser_turn(count: int = 15, *, full_turn: bool = False) -> tuple[float, ...]:
-    """Evenly spread angles (deg) of the calibration polariser, over half a turn or a full one.
+    """Angles (deg) of the calibration polariser, spread evenly over half a turn or a full one.
 
-    Light behind the polariser is the same half a turn later: of a full turn an odd `count` has so many directions, an
-    even one half as many, each twice.
+    Half a turn later the light behind the polariser is the same. Over a full turn an odd `count` therefore gives
+    `count` directions, an even one half as many, each twice.
     """
     return tuple(float(a) for a in np.arange(count) * ((360.0 if full_turn else 180.0) / count))
 

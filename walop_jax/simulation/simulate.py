@@ -21,7 +21,7 @@ from walop_jax.io.text import rounded
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre, light
-from walop_jax.model.cameras import with_floor
+from walop_jax.model.cameras import with_noise_floor
 from walop_jax.model.compiled import array
 from walop_jax.model.dependence import needs
 from walop_jax.model.effects import EFFECTS, EffectKind, effect_by_name, in_order
@@ -36,7 +36,7 @@ from walop_jax.model.specification import Model, make_model, series_indices
 from walop_jax.model.standards import standards_of
 from walop_jax.simulation.observing_plan import EXPOSED, ObservingPlan
 
-Cube = Float[np.ndarray, "p e k"]
+ByPointExposureCamera = Float[np.ndarray, "p e k"]
 
 LEVEL = 0.5
 LEVEL_SCATTER = 0.03  # of the cameras' throughput around 0.5
@@ -50,7 +50,7 @@ _LISTED = 12  # numbers of a parameter that are listed
 
 
 class Simulated(NamedTuple):
-    """A synthetic calibration set and the instrument that made it."""
+    """A synthetic calibration set and the true instrument that made it."""
 
     calset: CalibrationSet
     truth: Instrument
@@ -74,9 +74,9 @@ def draw_instrument(model: Model, rng: np.random.Generator) -> Instrument:
     """An instrument as it might have been built.
 
     Every parameter with a prior is drawn from it (efficiencies of analysers stop at 1), tied ones follow; throughputs
-    are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras
-    share is a gauge, so the constant of camera N0 is 0.5; of arms whose share of the light is unknown the first camera
-    is 0.5 all over. Other parameters without a prior stay at their start values.
+    are drawn as smooth maps: levels 0.5 ± 0.03, structure over the field of 2 % rms. The scale that all cameras share
+    is a gauge, so the constant of camera N0 is 0.5; of arms whose fraction of the light is unknown the first camera is
+    0.5 all over. Other parameters without a prior stay at their start values.
     """
     values = model.start
     for i, p in enumerate(model.parameters):
@@ -95,13 +95,13 @@ def _throughput(template: Instrument, rng: np.random.Generator) -> Float[np.ndar
     cameras = len(template.throughput.coefficients)
     level = 0.5 + LEVEL_SCATTER * rng.standard_normal(cameras)
     shape = rng.standard_normal((cameras, len(terms)))
-    share = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
-    share /= max(float(np.linalg.norm(share)), 1.0)
+    size = np.where(degree > 0, 1.0 / np.maximum(degree, 1), 0.0)
+    size /= max(float(np.linalg.norm(size)), 1.0)
     # The mean square of P_i P_j over the field is 1 / ((2i + 1)(2j + 1)).
-    relative = STRUCTURE * shape * share * np.sqrt(np.prod(2 * terms + 1, axis=1))
+    relative = STRUCTURE * shape * size * np.sqrt(np.prod(2 * terms + 1, axis=1))
     relative[:, 0] = 1.0
-    units = list(template.cameras.units)
-    level[units], relative[units, 1:] = level[0], 0.0
+    references = list(template.cameras.ratio_references)
+    level[references], relative[references, 1:] = level[0], 0.0
     return 0.5 * level[:, None] / level[0] * relative
 
 
@@ -150,10 +150,10 @@ def _stars_of(plan: ObservingPlan, catalogue: Sources, true: Standards) -> tuple
 def _scattered(
     plan: ObservingPlan,
     truth: Instrument,
-    expected: Cube,
-    counts: Callable[[Instrument], Cube],
+    expected: ByPointExposureCamera,
+    counts: Callable[[Instrument], ByPointExposureCamera],
     rng: np.random.Generator,
-) -> Cube:
+) -> ByPointExposureCamera:
     """Counts that the stars of a field have beyond those of their mean q, u: light is linear in them."""
     _, source = plan.layout()
     measured, scatter = source[:, :, None] == plan.standards, np.zeros_like(expected)
@@ -248,9 +248,9 @@ def simulate(
         true_error = np.hypot(plan.noise_scale * stated, plan.noise_fraction * expected)
         if (plan.noise_scale, plan.noise_fraction) != (1.0, 0.0):
             counts = expected + (counts - expected) * true_error / stated
-        if floor := truth.cameras.floor:
+        if floor := truth.cameras.noise_floor:
             # Noise up to the errors that fits take the cameras to have; N_ERR has it not.
-            beyond = np.sqrt(with_floor(stated, expected, floor) ** 2 - stated**2)
+            beyond = np.sqrt(with_noise_floor(stated, expected, floor) ** 2 - stated**2)
             counts += beyond * noise.standard_normal(expected.shape)
     table = TableIntensities.of(blank.intensities, blank.points)
     at = table.point, table.exposure
@@ -267,7 +267,7 @@ def true_instrument(
     catalogue_seed: int | None = None,
     catalogue: Sources | None = None,
 ) -> tuple[Sources, Instrument]:
-    """The catalogue of standards and the true instrument of `simulate`, by the same arguments."""
+    """The catalogue of standards and the true instrument that `simulate` uses for the same arguments."""
     build, stars = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)[:2])
     if catalogue_seed is not None:
         stars = np.random.default_rng(np.random.SeedSequence(catalogue_seed).spawn(4)[1])
@@ -312,9 +312,9 @@ def _without_light(plan: ObservingPlan, sources: Sources, seed: int, cameras: in
 
 
 def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.ndarray, "p e"]:
-    """Flux of every (point, exposure): transparency, illumination of the field, brightness of the stars.
+    """Flux (p, e) of every point and exposure: transparency, illumination of the field, brightness of the stars.
 
-    A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all are at their means.
+    A camera of throughput 0.5 sees a quarter of unpolarised light. Without `rng` all factors are at their means.
     """
     used, source = plan.layout()
     exposures = plan.exposures()
@@ -332,7 +332,9 @@ def fluxes(plan: ObservingPlan, rng: np.random.Generator | None) -> Float[np.nda
     return 4.0 * electrons * illumination[:, None] * transparency * brightness[source]
 
 
-def _expected(blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]) -> Cube:
+def _expected(
+    blank: CalibrationSet, truth: Instrument, flux: Float[np.ndarray, "p e"]
+) -> ByPointExposureCamera:
     """Expected counts (electron) of every (point, exposure), the response of the detectors included."""
     likelihood = Likelihood.of(blank, make_model(blank.instrument, truth))
     unit = np.concatenate(

@@ -28,9 +28,9 @@ _CATALOGUE = {field.name for field in dataclasses.fields(Sources)}
 
 @dataclasses.dataclass(frozen=True)
 class Template:
-    """Common to all nights of one instrument: the instrument as it is, and the catalogue of its standards.
+    """What all nights of one simulated instrument have in common: the instrument, and the catalogue of its standards.
 
-    `plan` is the one that it was simulated with, if any.
+    `plan` is the plan that it was simulated with, if there was one.
     """
 
     instrument: Instrument
@@ -68,7 +68,7 @@ class Template:
 
     @classmethod
     def of(cls, simulated: Simulated) -> Template:
-        """Of a simulated night."""
+        """The template of a simulated night."""
         return cls(simulated.truth, simulated.calset.sources)
 
 

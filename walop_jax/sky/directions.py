@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Degrees = Float[np.ndarray, " n"]
+from walop_jax.io.shapes import Vector
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,17 +45,17 @@ class Pointing:
         plane.wcs.cd = [[sin, cos], [cos, -sin]]
         return plane
 
-    def field_of(self, ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees]:
+    def field_of(self, ra: Vector, dec: Vector) -> tuple[Vector, Vector]:
         """X and Y (deg) of stars in the hemisphere about the field centre."""
         x, y = self._plane().wcs_world2pix(ra, dec, 1)
         return np.asarray(x, float), np.asarray(y, float)
 
-    def sky_of(self, x: Degrees, y: Degrees) -> tuple[Degrees, Degrees]:
+    def sky_of(self, x: Vector, y: Vector) -> tuple[Vector, Vector]:
         """Right ascension and declination (deg) of field points."""
         ra, dec = self._plane().wcs_pix2world(x, y, 1)
         return np.mod(np.asarray(ra, float), 360.0), np.asarray(dec, float)
 
-    def rotator_at(self, ra: Degrees, dec: Degrees) -> Degrees:
+    def rotator_at(self, ra: Vector, dec: Vector) -> Vector:
         """Position angle of +X (deg) at stars, from their own north."""
         centre, stars = _directions(self.ra, self.dec), _directions(ra, dec)
         outward = np.asarray(centre.position_angle(stars).deg)
@@ -70,10 +70,10 @@ def separation(ra: Any, dec: Any, other_ra: Any, other_dec: Any) -> Float[np.nda
     return np.asarray(np.rad2deg(angular_separation(*map(np.deg2rad, (ra, dec, other_ra, other_dec)))))
 
 
-def galactic(ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees, Degrees]:
-    """Galactic longitude and latitude of directions, and the position angle of Galactic north there (deg).
+def galactic(ra: Vector, dec: Vector) -> tuple[Vector, Vector, Vector]:
+    """Galactic longitude and latitude of directions, and the position angle of Galactic north there (all in deg).
 
-    A position angle from Galactic north is that from equatorial north less the last one.
+    A position angle from Galactic north is the angle from equatorial north less the position angle of Galactic north.
     """
     stars: Any = _directions(ra, dec)
     pole: Any = SkyCoord(0.0, 90.0, unit="deg", frame="galactic")
@@ -85,7 +85,7 @@ def galactic(ra: Degrees, dec: Degrees) -> tuple[Degrees, Degrees, Degrees]:
     return longitude, latitude, north
 
 
-def designations(ra: Degrees, dec: Degrees) -> np.ndarray:
+def designations(ra: Vector, dec: Vector) -> np.ndarray:
     """Names of directions (deg) by their coordinates, Jhhmmss.ss+ddmmss.s, cut off as the IAU asks."""
     seconds = np.floor(np.mod(ra, 360.0) / 15.0 * 360000.0 + 1e-6).astype(int) % 8640000  # hundredths
     arcsec = np.floor(np.abs(dec) * 36000.0 + 1e-6).astype(int)  # tenths
@@ -99,8 +99,10 @@ def designations(ra: Degrees, dec: Degrees) -> np.ndarray:
     )
 
 
-def same_stars(ra: Degrees, dec: Degrees, tolerance: float) -> Int[np.ndarray, " n"]:
-    """The number of the star of every position (deg): chains of those within a tolerance (arcsec) are one star."""
+def same_stars(ra: Vector, dec: Vector, tolerance: float) -> Int[np.ndarray, " n"]:
+    """The number of the star of every position (deg): positions chained by steps within a tolerance (arcsec) are one
+    star.
+    """
     stars = _directions(ra, dec)
     first, second, *_ = stars.search_around_sky(stars, tolerance * units.arcsec)
     pairs = coo_array((np.ones(len(first)), (first, second)), shape=(len(ra), len(ra)))
@@ -142,10 +144,10 @@ def registered(
     of_reference: Float[np.ndarray, " m"],
     tolerance: float,
 ) -> Registration:
-    """The shift and rotation of positions (deg, on the tangent plane) against others of the same stars.
+    """The shift and rotation of positions (deg, on the tangent plane) against reference positions of the same stars.
 
-    Differences of all pairs of bright stars within `REACH` have a peak at the shift; the pairs there give shift and
-    rotation by least squares, each round with those that are closer. No peak above chance: `pairs` is 0.
+    Differences of all pairs of bright stars within `REACH` have a peak at the shift. The pairs in the peak give shift
+    and rotation by least squares; each round takes the pairs that are closer. Without a peak above chance `pairs` is 0.
     """
     bright = place[np.argsort(-brightness, kind="stable")[:BRIGHTEST]]
     bright_reference = reference[np.argsort(-of_reference, kind="stable")[:BRIGHTEST]]
@@ -182,10 +184,10 @@ def registered(
 def mutual(
     place: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "m 2"], tolerance: float
 ) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Pairs of positions (deg, within a few degrees of the origin) that are nearest to each other within a tolerance.
+    """Pairs of positions (deg, near the origin) that are each other's nearest, within a tolerance (arcsec).
 
-    The tolerance is in arcsec. First comes which positions are ambiguous, a second one of the reference being within it
-    as well; then the pairs, by their numbers in the two lists.
+    Returned are: True for positions that are ambiguous, as a second one of the reference lies within the tolerance as
+    well; then the pairs, by their numbers in the two lists.
     """
     if not len(place) or not len(reference):
         return np.zeros(len(place), bool), np.zeros(0, int), np.zeros(0, int)
@@ -199,5 +201,5 @@ def mutual(
     return np.asarray(ambiguous), pairs, np.asarray(nearest)[pairs]
 
 
-def _directions(ra: float | Degrees, dec: float | Degrees) -> Any:
+def _directions(ra: float | Vector, dec: float | Vector) -> Any:
     return SkyCoord(ra, dec, unit="deg", frame="icrs")

@@ -13,7 +13,7 @@ tan(position angle) = b / a, so that
 which needs no angle and stays smooth at γ = 0. All functions here give δ = 1; δ is a parameter of the fit.
 
 North and east at a field point are those of the field centre, carried there by the smallest rotation
-(the meridian convergence is thereby taken out), in the words of the instrument frame:
+(the meridian convergence is thereby taken out), as in the definition of the instrument frame:
 
     n(k) = n − (k·n) / (1 + k·c) · (k + c).
 """
@@ -33,10 +33,8 @@ from jaxtyping import Float
 from walop_jax.data.kinds import EPHEMERIS_MJD
 from walop_jax.data.records import Exposures, Site
 from walop_jax.io.errors import fail
+from walop_jax.io.shapes import OfExposures
 from walop_jax.sky.position_angles import sky_to_instrument
-
-Values = Float[np.ndarray, " e"]
-"""One of every exposure; angles in degrees, times in UTC days (MJD)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class SkyOfExposures:
     site: Site
 
     @functools.cached_property
-    def _moonlit(self) -> tuple[np.ndarray, Values, Values]:
+    def _moonlit(self) -> tuple[np.ndarray, OfExposures, OfExposures]:
         """Rows of the exposures of the full Moon, and the direction of the Moon then."""
         rows = np.flatnonzero(self.exposures.direct("moon"))
         return rows, *_moon_at(tuple(self.exposures.mjd[rows].tolist()), self.site)
@@ -69,16 +67,16 @@ class SkyOfExposures:
 
 
 @functools.lru_cache(maxsize=32)
-def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[Values, Values]:
-    """Direction of the Moon, kept: the same set is brought together with many models."""
+def _moon_at(mjd: tuple[float, ...], site: Site) -> tuple[OfExposures, OfExposures]:
+    """Direction of the Moon, kept for the next call: one set is often combined with many models."""
     return body_direction("moon", np.array(mjd), site) if mjd else (np.zeros(0), np.zeros(0))
 
 
 def moon_sky(
-    mjd: Values,
-    ra: Values,
-    dec: Values,
-    rotator: Values,
+    mjd: OfExposures,
+    ra: OfExposures,
+    dec: OfExposures,
+    rotator: OfExposures,
     site: Site,
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
@@ -93,7 +91,7 @@ def moon_sky(
     return rayleigh_sky(*body_direction("moon", mjd, site), ra, dec, rotator, x, y)
 
 
-def body_direction(name: str, mjd: Values, site: Site) -> tuple[Values, Values]:
+def body_direction(name: str, mjd: OfExposures, site: Site) -> tuple[OfExposures, OfExposures]:
     """Return right ascension and declination (degrees, GCRS axes) of the Moon, or the Sun, as seen from the site.
 
     The Moon is 60 Earth radii away: its parallax of up to a degree makes the site matter. `mjd` in UTC days.
@@ -127,7 +125,7 @@ def body_direction(name: str, mjd: Values, site: Site) -> tuple[Values, Values]:
         return np.asarray(body.ra.deg, dtype=np.float64), np.asarray(body.dec.deg, dtype=np.float64)
 
 
-def altitude(mjd: Values, ra: Values, dec: Values, site: Site) -> Values:
+def altitude(mjd: OfExposures, ra: OfExposures, dec: OfExposures, site: Site) -> OfExposures:
     """Return the altitude (deg) of directions (deg) at UTC days, without refraction, to the precession since 2000.
 
     sin h = sin φ sin δ + cos φ cos δ cos H, H the hour angle (Meeus 1998, Astronomical Algorithms, equation 13.6).
@@ -139,8 +137,8 @@ def altitude(mjd: Values, ra: Values, dec: Values, site: Site) -> Values:
 
 
 def offset_direction(
-    ra: Values, dec: Values, position_angle: Values, separation: Values
-) -> tuple[Values, Values]:
+    ra: OfExposures, dec: OfExposures, position_angle: OfExposures, separation: OfExposures
+) -> tuple[OfExposures, OfExposures]:
     """Return right ascension and declination of the points that far from others, north through east; all in degrees."""
     from astropy.coordinates import offset_by
 
@@ -148,7 +146,7 @@ def offset_direction(
     return np.mod(direction[0].deg, 360.0), np.asarray(direction[1].deg)
 
 
-def local_sidereal_time(mjd: Values, longitude: float) -> Values:
+def local_sidereal_time(mjd: OfExposures, longitude: float) -> OfExposures:
     """Return the local mean sidereal time (deg) at UTC days and a longitude (deg, east positive), to a few arcsec.
 
     Source: Meeus 1998, Astronomical Algorithms, equation 12.4, without its terms in T². UTC stands for UT1, so that the
@@ -192,11 +190,11 @@ def _earth_orientation() -> Any:
 
 
 def rayleigh_sky(
-    moon_ra: Values,
-    moon_dec: Values,
-    ra: Values,
-    dec: Values,
-    rotator: Values,
+    moon_ra: OfExposures,
+    moon_dec: OfExposures,
+    ra: OfExposures,
+    dec: OfExposures,
+    rotator: OfExposures,
     x: Float[np.ndarray, " p"],
     y: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e"]]:

@@ -1,11 +1,10 @@
-"""The night of an exposure: one definition for all that asks.
-
-A night lasts from noon to noon of the mean Sun at the site, and has the MJD of its evening:
+"""The night of an exposure, defined once for the whole package.
 
     night = ⌊MJD + λ/360° − ½⌋        λ the longitude, east positive, −180° to 180°
 
-Where the longitude is not known, noon is the middle of the longest part of the day without an exposure. Exposures of
-the same night in another file may then make another noon: with the longitude they cannot.
+A night lasts from noon to noon of the mean Sun at the site, and has the MJD of its evening. Where the longitude is not
+known, noon is the middle of the longest part of the day without an exposure. Exposures of the same night in another
+file may then make another noon; with the longitude they cannot.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from walop_jax.model.instrument import nominal_instrument
 from walop_jax.model.parameters import NAME
 from walop_jax.model.planning import exposure_arrays
 from walop_jax.model.ray import Ray
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import make_model
 
 
@@ -373,8 +373,8 @@ def test_factors_of_single_exposures_by_hand():
     ["hours", "hours 0 to 2", "exposure 3", "kind moon", "side CLP", "order", "night hours", "per EXPTIME"],
 )
 def test_a_change_in_single_exposures_is_not_known_for_stars(given):
-    assert Change.parsed("gain of O1").of_stars
-    assert not Change.parsed(f"gain of O1 * {given}").of_stars
+    assert Change.parsed("gain of O1").applies_to_catalogue
+    assert not Change.parsed(f"gain of O1 * {given}").applies_to_catalogue
 
 
 def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sky_alone():
@@ -390,9 +390,11 @@ def test_polarisation_that_a_telescope_adds_grows_with_time_in_light_from_the_sk
         bare.kinds,
         (),
     )
-    sight = Sight(exposures, jnp.zeros((3, 2)), jnp.full(3, -1), jnp.asarray(0.1), jnp.asarray(0.0))
+    illumination = PointIllumination(
+        exposures, jnp.zeros((3, 2)), jnp.full(3, -1), jnp.asarray(0.1), jnp.asarray(0.0)
+    )
     with_it, without = (
-        np.asarray(light.stokes(dataclasses.replace(bare, effects=effects), sight))
+        np.asarray(light.stokes(dataclasses.replace(bare, effects=effects), illumination))
         for effects in ((said,), ())
     )
     np.testing.assert_allclose(with_it - without, [[0] * 4, [0, 2e-3, 0, 0], [0] * 4], atol=1e-15)

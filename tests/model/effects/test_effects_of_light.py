@@ -14,7 +14,7 @@ import pytest
 from walop_jax.model import light, mueller
 from walop_jax.model.effects import effect_by_name
 from walop_jax.model.effects.base import Effect
-from walop_jax.model.sources import Sight
+from walop_jax.model.sources import PointIllumination
 
 ONE = builders.exposures({"clp_angle": 30.0}, {"kind": "moon"}, {"kind": "standard", "rotator": 0.0})
 
@@ -28,8 +28,10 @@ def stokes(*effects: Effect, sky=(0.1, 0.0), rows=ONE, source=(-1, -1, 0)) -> np
     device = dataclasses.replace(builders.south(standards=scenes.STARS), effects=effects)
     arrays = scenes.plan(effects, rows).exposures
     everywhere = jnp.broadcast_to(jnp.asarray(sky), (len(rows), 2))
-    sight = Sight(arrays, everywhere, jnp.asarray(source), jnp.asarray(0.1), jnp.asarray(-0.2))
-    return np.asarray(light.stokes(device, sight))
+    illumination = PointIllumination(
+        arrays, everywhere, jnp.asarray(source), jnp.asarray(0.1), jnp.asarray(-0.2)
+    )
+    return np.asarray(light.stokes(device, illumination))
 
 
 def linear(angle: float, degree: float = (1 - 2e-5) / (1 + 2e-5)) -> list[float]:
@@ -113,7 +115,9 @@ def test_moon_multiple_scattering_at_the_moon_itself():
     def q(p):
         there = dataclasses.replace(device, effects=(make("moon_multiple_scattering", p=p),))
         zero = jnp.asarray(0.0)
-        return light.stokes(there, Sight(arrays, jnp.zeros((3, 2)), jnp.array([-1, -1, 0]), zero, zero))
+        return light.stokes(
+            there, PointIllumination(arrays, jnp.zeros((3, 2)), jnp.array([-1, -1, 0]), zero, zero)
+        )
 
     assert np.isfinite(np.asarray(jax.jacfwd(q)(jnp.asarray(0.01)))).all()
 

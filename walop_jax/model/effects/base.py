@@ -35,12 +35,12 @@ from walop_jax.model.parameters import Scalar as Scalar
 
 
 class Context(NamedTuple):
-    """Facts about the data for the effects.
+    """What effects need to know of the data.
 
-    `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the
-    names of the standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is
-    that of the polariser without the effect, `units` the scales of field and wavelength. `largest` are the largest
-    values of factors of changes (`factors.largest_factors`); what is not there is at most about 1.
+    `moon` holds the positions of the Moon exposures and `moon_ids` their EXPOSURE numbers; `sources` the names of the
+    standards, `exposures` the number of exposures, `cameras` the names of the cameras; `extinction` is the extinction
+    of the polariser without the effect, `units` the scales of field and wavelength. `largest` are the largest values of
+    factors of changes (`factors.largest_factors`); a factor that is not there is at most about 1.
     """
 
     exposures: int = 0
@@ -54,17 +54,16 @@ class Context(NamedTuple):
 
 
 class Effect(Component):
-    """A physical effect beyond the base model.
+    """A physical effect beyond the base model, such as a half-wave plate that is turned (`hwp1_axis`).
 
-    Its parameters are the `param` fields; static fields are its discrete choices (which camera, which
-    star). `shape` names the non-linear parameters (phase, gap, position); all others are
-    amplitudes, without effect at neutral, whatever the shape. `starts` are groups of initial shapes for a
-    search: groups are alternatives, the members of a group are directions of a joint fit that `combine` turns
-    into one effect. `one_sided` names amplitudes that physics keeps above neutral; `over_field` is true for an
-    effect visible only in several field points, `watched` for one that may change from night to night and that `check`
-    looks for in stars; `reference` is its source; `said` are its changes (`change`),
-    empty for an effect beyond them. `unlisted` says what its parameters are if there are too many of them to be listed
-    in print; it is empty for an effect whose parameters are listed.
+    Its parameters are the `param` fields; static fields are its discrete choices (which camera, which star). `shape`
+    names the non-linear parameters (phase, gap, position); all others are amplitudes, which do nothing at neutral,
+    whatever the shape. `starts` are groups of initial shapes for a search: groups are alternatives, the members of a
+    group are directions of a joint fit that `combine` turns into one effect. `one_sided` names amplitudes that physics
+    keeps above neutral; `over_field` is true for an effect that only several field points can show, `watched` for one
+    that may change from night to night, so that `check` looks for it in stars; `reference` is its source; `said` are
+    its changes (`change`), empty for an effect beyond them. `unlisted` says what its parameters are if there are too
+    many of them to be listed in print; it is empty for an effect whose parameters are listed.
 
     >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
     'hwp1_axis'
@@ -129,7 +128,7 @@ class Effect(Component):
 
     @classmethod
     def numbers(cls) -> dict[str, Parameter]:
-        """Its parameters, by name."""
+        """The parameters by name, as the class declares them."""
         return field_declarations(cls)
 
     @classmethod
@@ -150,15 +149,15 @@ class Effect(Component):
         return type(self)
 
     def declarations(self) -> Mapping[str, Parameter]:
-        """Its parameters, by name."""
+        """The parameters of this effect by name."""
         return self.kind.numbers()
 
     def replaced(self, **values: Any) -> Self:
-        """With other values of parameters, or other choices."""
+        """The effect with other values of parameters, or other choices."""
         return dataclasses.replace(self, **values)
 
     def given(self, context: Context, **values: Any) -> Self:
-        """With values as for `of`."""
+        """The effect with values as `of` takes them."""
         numbers, choices = self.declarations(), self.choices()
         for name, value in values.items():
             if name in numbers:

@@ -1,7 +1,7 @@
 """A dark spot in front of one camera.
 
 Equation    throughput × (1 − depth · exp(−((X − x)² + (Y − y)²) / 2 size²)) in one camera
-Symbols     x, y centre and size (standard deviation) [deg]; depth, a share
+Symbols     x, y centre and size (standard deviation) [deg]; depth, a fraction
 Source      dust near a focal plane, or a damaged coating.
 Neutral     depth = 0, at any position
 Revealed by a local zero offset of one half, the same in all exposures.
@@ -46,7 +46,7 @@ class Spot(Transmission):
     cameras: int = eqx.field(static=True)
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """Share of the throughput behind the spot."""
+        """Fraction of the throughput behind the spot."""
         distance = _distance(self, x, y)
         return jnp.ones(self.cameras).at[self.camera].add(-self.depth * jnp.exp(-distance))
 
@@ -69,7 +69,7 @@ class Blemish(Effect):
     x: Scalar = param("deg", "centre along X", SOURCE, scale=0.02, loose=1.0, default=0.0)
     y: Scalar = param("deg", "centre along Y", SOURCE, scale=0.02, loose=1.0, default=0.0)
     size: Scalar = param("deg", "standard deviation of the spot", SOURCE, scale=0.02, loose=0.5, default=0.05)
-    depth: Scalar = param("", "share that is missing", SOURCE, width=0.02, default=0.0)
+    depth: Scalar = param("", "fraction that is missing", SOURCE, width=0.02, default=0.0)
     camera: int = eqx.field(static=True, default=0)
 
     name: ClassVar[str] = "blemish"

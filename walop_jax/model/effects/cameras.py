@@ -19,7 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from walop_jax.model.cameras import DetectorPart, ExposurePart, GhostPart, Mixing, Places, Transmission
+from walop_jax.model.cameras import (
+    DetectorPart,
+    ExposurePart,
+    FieldCoordinate,
+    GhostPart,
+    Mixing,
+    Transmission,
+)
 from walop_jax.model.effects.change import (
     KINDS,
     OPPOSITE,
@@ -27,9 +34,9 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     Scalar,
     SlotTerm,
     Term,
@@ -40,7 +47,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component, unknown_name
 from walop_jax.model.sources import ExposureArrays
 
-Weights = tuple[float, ...]
+CameraWeights = tuple[float, ...]
 REFERENCE_COUNTS = 1e6  # electron
 
 
@@ -49,11 +56,11 @@ class _Cameras(Component):
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
-    cameras: tuple[Weights, ...] = eqx.field(static=True)
+    cameras: tuple[CameraWeights, ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, instrument: Instrument, terms: Sequence[Term], **fixed: Any) -> _Cameras:
-        """The changes of an instrument."""
+        """The changes `terms`, each with the weight of every camera of the instrument."""
         changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
         return cls(amplitudes, changes, tuple(cameras_of(instrument, c.place) for c in changes), **fixed)
 
@@ -67,7 +74,7 @@ class Shade(_Cameras, Transmission):
     """Gains that depend on the field alone."""
 
     def factors(self, x: Scalar, y: Scalar) -> Float[Array, " k"]:
-        """1 + Σ amplitude × pattern."""
+        """1 + Σ amplitude × pattern, the factor of each camera (k) at a field point."""
         patterns = jnp.stack([jnp.asarray(change.factor(AtPoint(x, y)), float) for change in self.changes])
         return 1.0 + patterns @ self.sizes
 
@@ -76,31 +83,31 @@ class GainOfExposures(_Cameras, ExposurePart):
     """Gains that depend on the exposure, or on exposure and field."""
 
     def factors(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"]:
-        """1 + Σ amplitude × pattern."""
+        """1 + Σ amplitude × pattern, the factor of each camera in every exposure (e, k)."""
         patterns = jnp.stack([in_exposures(change, exposures, x, y) for change in self.changes])
         return 1.0 + patterns.T @ self.sizes
 
 
 class CrossTalk(Mixing):
-    """Shares of the light of cameras in other ones."""
+    """Fractions of the light of cameras in other ones."""
 
     amplitudes: tuple[Scalar, ...]
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (target, origin)
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-        """Mix the analysis vectors."""
+        """The analysis vectors (b, k, 4) with the light of other cameras added."""
         targets, origins = (np.array(column) for column in zip(*self.pairs, strict=True))
         shares = jnp.stack(self.amplitudes)[:, None]
         return vectors.at[:, targets].add(shares * vectors[:, origins])
 
 
 class Ghost(GhostPart):
-    """Shares of the light of the opposite field point, for extended sources."""
+    """Fractions (k) of the light of the opposite field point that reach each camera, for extended sources."""
 
     shares: Float[Array, " k"]
 
     def seen(self, extended: Bool[Array, " e"], opposite: Float[Array, "e k"]) -> Float[Array, "e k"]:
-        """Addition from the opposite point."""
+        """Counts (e, k) that the light of the opposite point adds."""
         return jnp.where(extended[:, None], self.shares * opposite, 0.0)
 
 
@@ -134,9 +141,9 @@ class OfDetectors(_Cameras, DetectorPart):
     stage: str = eqx.field(static=True, default="reported")
 
     def reported(
-        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: Places, y: Places
+        self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: FieldCoordinate, y: FieldCoordinate
     ) -> Float[Array, "e k"]:
-        """Counts with the additions."""
+        """The counts (e, k) with the additions of this stage."""
         added, total = ADDED[self.stage](counts, exposures), counts
         for change, size in zip(self.changes, self.sizes, strict=True):
             of_exposures = any(factor.depends_on == EXPOSURE for factor in change.grows_with)
@@ -146,7 +153,7 @@ class OfDetectors(_Cameras, DetectorPart):
 
 
 def stage_of(change: Change) -> str:
-    """Stage at which a change acts: a key of `ADDED`, "throughput", "counts", "mixed" or "opposite"."""
+    """The stage at which a change acts: a key of `ADDED`, "throughput", "counts", "mixed" or "opposite"."""
     if change.kind == "light":
         return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
     if change.kind != "gain":
@@ -235,11 +242,16 @@ _TESTS = {
     "afterglow": "a dark exposure after a bright one",
     "light": "the same field points at another flux, and darks",
 }
-KINDS |= {name: Kind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()}
+KINDS |= {
+    name: ChangeKind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()
+}
 
 
-def cameras_of(instrument: Instrument, place: str) -> Weights:
-    """1 for the cameras of a place: a camera, or an arm. Raises ValueError for any other name."""
+def cameras_of(instrument: Instrument, place: str) -> CameraWeights:
+    """Weights of the cameras: 1 for the cameras of `place`, a camera or an arm, else 0.
+
+    Raises ValueError for any other name.
+    """
     names = instrument.cameras.names
     for arm in instrument.arms:
         if arm.name == place:

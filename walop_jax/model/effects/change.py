@@ -1,16 +1,17 @@
 """A change of an instrument with one amplitude: a kind, at a place, with factors.
 
-    KIND PREPOSITION PLACE [* FACTOR ...]
+    KIND RELATION PLACE [* FACTOR ...]
 
     retardance q behind collimator * r2         a linear retarder with its axis along X, growing as r² over the field
     turn of polariser * cos 2 CLP               an axis turned by an amount that depends on its own reading
     gain of O1 * hours                          a camera that grows more sensitive
-    light of E1 in O1                           a share of the counts of one camera in another one
+    light of E1 in O1                           a fraction of the counts of one camera in another one
     polarisation q of HD_14069                  a star that differs from the catalogue
 
-An amplitude of 0 has no effect. A kind (`Kind`), defined in the file of its family (`optics`, `cameras`, `numbers`),
-holds the action of a change on an instrument. Factors (`factors`) multiply each other; without one the amplitude is the
-same everywhere.
+RELATION is a preposition: "ahead of", "behind", "of" or "in" (`Change.relation`); PLACE is the name of an element, a
+camera or a star (`Change.place`). An amplitude of 0 changes nothing. The kind of a change (`ChangeKind`), defined in
+the file of its family (`optics`, `cameras`, `numbers`), says what a change does to an instrument. Factors (`factors`)
+multiply each other; without a factor the amplitude is the same everywhere.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from walop_jax.model.ray import NotPlannedError, Ray
 from walop_jax.model.sources import ExposureArrays
 
 Term = tuple["Change", Scalar]
-Given = str | Callable[[Any], Any]
+FactorLike = str | Callable[[Any], Any]
 """A factor: a text, or a function of the quantities of factors."""
 OPPOSITE = "opposite"  # the field point, as an origin of light
 SLOW, SINGLE = ("hours", "kelvin", "hour angle"), ("per EXPTIME", "order", "night hours")
@@ -80,10 +81,11 @@ class Combinations(NamedTuple):
 
 
 class Grows(NamedTuple):
-    """Dependences allowed in a change (`Factor.depends_on`), on which `angle`, and combinations `tried` in a diagnosis.
+    """What a change may grow with: dependences (`Factor.depends_on`), an angle, and the combinations `tried` in a
+    diagnosis.
 
-    `angle` is the prefix of the columns of one element; None: any element, and also single exposures and those of a
-    KIND.
+    `angle` is the prefix of the columns of the one element whose angle is allowed; None: any element, and also single
+    exposures and exposures of one KIND.
     """
 
     allowed: tuple[str, ...] = ()
@@ -92,7 +94,7 @@ class Grows(NamedTuple):
 
 
 class NoSlotError(ValueError):
-    """A change without a sum of slots to first order: it needs its own derivative."""
+    """A change that is no sum of slots to first order, so that it needs a derivative of its own."""
 
 
 class SlotTerm(NamedTuple):
@@ -100,7 +102,7 @@ class SlotTerm(NamedTuple):
 
     slot: tuple[Any, ...]
     size: float
-    factors: tuple[Given, ...]
+    factors: tuple[FactorLike, ...]
 
 
 SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
@@ -108,16 +110,18 @@ SlotTerms = Callable[["Instrument", "Change"], Iterable[SlotTerm]]
 
 def itself(stage: str) -> SlotTerms:
     """Slots of changes with a slot of their own: without factors, at a stage of the light path."""
-    return lambda _, change: [SlotTerm((stage, change.kind, change.where, change.place), 1.0, change.factors)]
+    return lambda _, change: [
+        SlotTerm((stage, change.kind, change.relation, change.place), 1.0, change.factors)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
-class Kind:
+class ChangeKind:
     """A kind of change: one of `AMPLITUDES`, its patch of an instrument, the observation that would test it.
 
-    Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise
-    `NoSuchPlaceError` where an instrument has no such place, ValueError for an impossible change. `slots` are its
-    first-order terms; slots beyond an instrument are no error here.
+    Changes with equal `patch` and `together` are patched together. `patch` and `grows` raise `NoSuchPlaceError` where
+    an instrument has no such place, ValueError for an impossible change. `slots` are its first-order terms; slots that
+    an instrument does not have are no error here. The kind `gain`, for instance, multiplies the counts of a camera.
     """
 
     parameter: str
@@ -130,21 +134,23 @@ class Kind:
 
 OF_CAMERAS = ("gain", "reported gain", "light", "afterglow")
 """Kinds of changes of counts."""
-KINDS: dict[str, Kind] = {}
+KINDS: dict[str, ChangeKind] = {}
 """All kinds by their names, which begin the texts of their changes; filled by the files of their families."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A kind at a place with its factors; `origin` is the origin of its light: another camera, or `OPPOSITE`.
+    """A change: a kind, at a place, with factors; `origin` is where its light comes from: another camera, or
+    `OPPOSITE`.
 
-    Factors are counted in the `units` of an instrument: those of WALOP until it is `counted_in` those of another.
+    Factors are counted in the `units` of an instrument, those of WALOP until the change is `counted_in` other units.
+    `Change.parsed("gain of O1 * hours")` has the kind "gain", the relation "of", the place "O1" and one factor.
     """
 
     kind: str
-    where: str
+    relation: str
     place: str
-    factors: tuple[Given, ...] = ()
+    factors: tuple[FactorLike, ...] = ()
     origin: str = ""
     units: Units = OF_WALOP
 
@@ -157,11 +163,11 @@ class Change:
     def text(self) -> str:
         """The change as it is typed."""
         origin = f" of {self.origin}" if self.origin else ""
-        return " * ".join((f"{self.kind}{origin} {self.where} {self.place}", *map(str, self.factors)))
+        return " * ".join((f"{self.kind}{origin} {self.relation} {self.place}", *map(str, self.factors)))
 
     @property
     def label(self) -> str:
-        """The same without blanks, for the name of a parameter."""
+        """The text of the change without blanks, for the name of a parameter."""
         return self.text.replace(" ", "_")
 
     @property
@@ -171,16 +177,16 @@ class Change:
 
     @property
     def grows_with(self) -> tuple[Factor, ...]:
-        """Its factors that have a text."""
+        """The factors that have a text."""
         return tuple(factor(item) for item in self.factors if isinstance(item, str))
 
     def counted_in(self, units: Units) -> Change:
-        """The change of an instrument with its scales."""
+        """The change with its factors counted in the scales `units`."""
         return dataclasses.replace(self, units=units)
 
     @property
-    def of_stars(self) -> bool:
-        """True if its effect on a star depends on the counts and the place of the star alone."""
+    def applies_to_catalogue(self) -> bool:
+        """True if its effect on a star depends on nothing but the counts and the field position of that star."""
         elsewhere = self.kind == "afterglow" or (self.kind == "light" and self.origin in ("", OPPOSITE))
         return not elsewhere and not any(
             item.text == "hours" or item.form in ("hours", *OF_LIST) for item in self.grows_with
@@ -193,12 +199,12 @@ class Change:
 
     @property
     def over_field(self) -> tuple[str, ...]:
-        """Its factors that are patterns over the field."""
+        """Texts of its factors that are patterns over the field."""
         return tuple(item.text for item in self.grows_with if item.depends_on == FIELD)
 
     @property
     def beside_field(self) -> tuple[str, ...]:
-        """Its factors that are no patterns over the field."""
+        """Texts of its factors that are no patterns over the field."""
         return tuple(item.text for item in self.grows_with if item.depends_on != FIELD)
 
     def times(self, *factors: str) -> Change:
@@ -206,7 +212,10 @@ class Change:
         return dataclasses.replace(self, factors=(*self.factors, *factors))
 
     def width(self, largest: Mapping[str, float]) -> float:
-        """Prior width of the amplitude: the change is as large as that where its factors are largest (`Context`)."""
+        """Prior width of the amplitude: the change is as large as its kind may be where its factors are largest.
+
+        `largest` are the largest values of factors (`Context`).
+        """
         sizes = (largest.get(item.text, 1.0) for item in self.grows_with)
         return AMPLITUDES[self.parameter].width / math.prod(sizes)
 
@@ -228,7 +237,7 @@ class Change:
         return matches[0]
 
     def factor(self, at: Any) -> Any:
-        """Product of its factors, 1 without any."""
+        """The product of its factors at `at`, 1 without any."""
         return product(self.factors, at, self.units)
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
@@ -246,7 +255,7 @@ class Change:
             if item.depends_on not in allowed or (single and not matching):
                 takes = ", ".join(allowed) or "nothing"
                 only = f"; of angles that of {angle} alone" if angle else ""
-                what = f"{self.kind} {self.where} {self.place} cannot grow with {item.text!r}"
+                what = f"{self.kind} {self.relation} {self.place} cannot grow with {item.text!r}"
                 raise ValueError(f"{self.text!r}: {what}, only with {takes}{only}")
 
     def in_words(self) -> str:
@@ -254,7 +263,10 @@ class Change:
         origin = "the opposite field point" if self.origin == OPPOSITE else self.origin
         of = f" of {origin}" if origin else ""
         return ", ".join(
-            (f"{self.kind}{of} {self.where} {self.place}", *(f.in_words(self.units) for f in self.grows_with))
+            (
+                f"{self.kind}{of} {self.relation} {self.place}",
+                *(f.in_words(self.units) for f in self.grows_with),
+            )
         )
 
     @property
@@ -265,9 +277,9 @@ class Change:
             advice.append("a star dithered over the field: its ghost moves the other way")
         elif test := KINDS[self.kind].test:
             advice.append(test)
-        elif self.where == "ahead of" and "." not in self.place:
+        elif self.relation == "ahead of" and "." not in self.place:
             advice.append("standards at several ROTATOR angles: light through the polariser does not have it")
-        elif self.where == "of":
+        elif self.relation == "of":
             advice.append("the same exposures without that element, or with it mounted turned over")
         else:
             advice.append(
@@ -287,14 +299,14 @@ def _parsed(text: str) -> tuple[str, str, str, tuple[str, ...], str]:
         )
     for text_of_factor in factors:
         factor(text_of_factor)
-    return match["kind"], match["where"], match["place"], tuple(factors), match["origin"] or ""
+    return match["kind"], match["relation"], match["place"], tuple(factors), match["origin"] or ""
 
 
 @functools.cache
 def _pattern() -> re.Pattern[str]:
     kinds = "|".join(re.escape(name) for name in sorted(KINDS, key=len, reverse=True))
     return re.compile(
-        rf"(?P<kind>{kinds})(?: of (?P<origin>\S+))? (?P<where>of|in|ahead of|behind) (?P<place>[^\s*]+)"
+        rf"(?P<kind>{kinds})(?: of (?P<origin>\S+))? (?P<relation>of|in|ahead of|behind) (?P<place>[^\s*]+)"
     )
 
 
@@ -310,7 +322,7 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     return instrument
 
 
-def product(factors: Iterable[Given], at: Any, units: Units) -> Any:
+def product(factors: Iterable[FactorLike], at: Any, units: Units) -> Any:
     """Product of factors, 1 without any."""
     values = (factor(item).value(at, units) if isinstance(item, str) else item(at) for item in factors)
     return functools.reduce(operator.mul, values, 1.0)
@@ -365,7 +377,7 @@ class InExposures:
 
     @property
     def number(self) -> Any:
-        """Positions in the list."""
+        """Positions (e) of the exposures in the list."""
         return np.arange(len(self.exposures.hours))
 
     def angle(self, prefix: str) -> Any:

@@ -63,12 +63,14 @@ class Described(Effect):
 
     @classmethod
     def neutral(cls, context: Context) -> Self:
-        """Nothing described."""
+        """The effect without any description."""
         return cls.of(context)
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """Descriptions with some values, zero elsewhere. Raises ValueError for an invalid description."""
+        """The effect with some descriptions, their amplitudes 0 unless given. Raises ValueError for an invalid
+        description.
+        """
         neutral: Any = _without_size(tuple(values.pop("sentences", ())))
         if unknown := sorted(set(values) - set(AMPLITUDES)):
             raise unknown_name(f"parameter of {cls.name}", unknown[0], (*AMPLITUDES, "sentences"))
@@ -78,7 +80,7 @@ class Described(Effect):
 
     @classmethod
     def combine(cls, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Self:
-        """One effect of members with a change each."""
+        """One effect of several members, each of which has a single change."""
         return cls.saying([text for member in group for text in member.sentences], amplitudes)
 
     @classmethod
@@ -100,7 +102,7 @@ class Described(Effect):
         return [change.label for change in map(Change.parsed, self.sentences) if change.parameter == field]
 
     def prior_widths(self, context: Context) -> dict[str, float]:
-        """Every change is as large as its kind may be where its factors are largest."""
+        """The widths by label: every change is as large as its kind may be where its factors are largest."""
         changes = [Change.parsed(text) for text in self.sentences]
         ordered = (change for name in AMPLITUDES for change in changes if change.parameter == name)
         return {change.label: change.width(context.largest) for change in ordered}
@@ -113,12 +115,12 @@ class Described(Effect):
             count[change.parameter] += 1
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """One change for each amplitude."""
+        """For each amplitude its one change, with the coefficient 1."""
         changes = [Change.parsed(text) for text in self.sentences]
         return tuple(((1.0, c),) for name in AMPLITUDES for c in changes if c.parameter == name)
 
     def patch(self, instrument: Instrument) -> Instrument:
-        """All changes, those at one place together."""
+        """The instrument with all changes, changes at one place together."""
         return patched(instrument, self.terms())
 
 

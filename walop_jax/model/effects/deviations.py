@@ -47,7 +47,7 @@ class Polynomials(Element):
     kind: ClassVar[str] = "deviations"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """Diattenuation, then retardance, then depolarisation."""
+        """Mueller matrices at the wavelengths of a ray: diattenuation, then retardance, then depolarisation."""
         assert self.of is not None
         at = AtPoint(ray.x, ray.y)
         basis = jnp.stack([product(names, at, self.of.units) + 0.0 * ray.x for names in CUBIC], axis=-1)
@@ -76,12 +76,12 @@ class Deviations(Effect):
 
     @classmethod
     def neutral(cls, context: Context) -> Self:
-        """None."""
+        """The effect without any deviation."""
         return cls.of(context)
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """Those at some `places` (preposition, element, factors), and those of other changes, zero unless given.
+        """Deviations at some `places` (relation, element, factors), and of other changes; 0 unless given.
 
         Raises ValueError for an unknown parameter.
         """
@@ -91,7 +91,7 @@ class Deviations(Effect):
         return none.given(context, **values)
 
     def labels(self, field: str) -> Sequence[str]:
-        """Descriptions without blanks."""
+        """Names of the elements of a parameter: its descriptions without blanks."""
         if field == "amounts":
             return [Change.parsed(text).label for text in self.sentences]
         changes = map(_at, self.places)
@@ -109,9 +109,9 @@ class Deviations(Effect):
             change = _at(text).counted_in(instrument.units)
             if instrument.polariser is not None and text.startswith(f"of {instrument.polariser.name}"):
                 raise ValueError(f"deviations {text!r}: the light of stars does not pass the polariser")
-            moves = instrument.element(change.place).moves if change.where == "of" else None
+            moves = instrument.element(change.place).moves if change.relation == "of" else None
             element = Polynomials(name=self.name, moves=moves, sizes=sizes, of=change)
-            instrument = beside(instrument, element, change.where, change.place)
+            instrument = beside(instrument, element, change.relation, change.place)
         return patched(instrument, zip(map(Change.parsed, self.sentences), self.amounts, strict=True))
 
 

@@ -57,9 +57,10 @@ class Member(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Entry:
-    """An effect of a catalogue; its `table` is that of the file. It has the attributes of a class of effects.
+    """An effect of a catalogue; `table` is its table in the file. It has the attributes of a class of effects.
 
-    `choices` are words, or "cameras" or "stars"; `arrangement` is one of `alternatives`.
+    `choices` are words, or "cameras" or "stars"; `arrangement` is a change of `alternatives`. `hwp1_axis` is one: its
+    parameter `angle` is the amplitude of `axis of half1.plate`.
     """
 
     name: str
@@ -91,11 +92,11 @@ class Entry:
 
     @property
     def shape(self) -> tuple[str, ...]:
-        """Non-linear parameters: angles."""
+        """Names of the non-linear parameters: the angles of polar pairs."""
         return tuple(member.polar for member in self.members if member.polar)
 
     def numbers(self) -> dict[str, Parameter]:
-        """Its parameters, by name."""
+        """The parameters by name, as declared."""
         return {member.name: member.declared for member in self.members}
 
     def amplitudes(self) -> tuple[str, ...]:
@@ -103,7 +104,7 @@ class Entry:
         return tuple(member.name for member in self.members if member.does)
 
     def is_structural(self) -> bool:
-        """True without parameters: present or absent."""
+        """True for an effect without parameters, which is present or absent."""
         return not self.members
 
     def head(self) -> str:
@@ -139,11 +140,11 @@ class Entry:
         return Named(values=values, entry=self, chosen=chosen, moon=moon)
 
     def of(self, context: Context, **values: Any) -> Named:
-        """As for any effect (`Effect.of`)."""
+        """The effect with some values and choices, as `Effect.of`."""
         return self.neutral(context).given(context, **values)
 
     def probes(self, context: Context) -> tuple[tuple[Named, ...], ...]:
-        """Every choice; of a polar pair both directions."""
+        """Effects at neutral for every choice, and for both directions of a polar pair."""
         choices: Mapping[Any, Sequence[Any]] = {
             "cameras": range(len(context.cameras)),
             "stars": context.sources,
@@ -158,7 +159,9 @@ class Entry:
         )
 
     def combine(self, group: Sequence[Any], amplitudes: Sequence[float] | Float[np.ndarray, " a"]) -> Named:
-        """As for any effect; size and angle from the two directions of a polar pair."""
+        """The effect from fitted amplitudes, as `Effect.combine`; for a polar pair size and angle from its two
+        directions.
+        """
         if (polar := self.polar) is None:
             return group[0].moved(amplitudes)
         first, second = amplitudes
@@ -192,16 +195,16 @@ class Named(Effect):
 
     @property
     def kind(self) -> Any:
-        """Its entry."""
+        """The entry that it was made of."""
         return self.entry
 
     @property
     def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of its entry."""
+        """The name of its entry."""
         return self.entry.name
 
     def labels(self, field: str) -> Sequence[str]:
-        """One value for each camera, or for each exposure of the Moon by its EXPOSURE number."""
+        """One name for each camera, or for each exposure of the Moon by its EXPOSURE number."""
         index = next(member.each for member in self.entry.members if member.name == field)
         if not index:
             return (field,)
@@ -211,17 +214,17 @@ class Named(Effect):
         )
 
     def choices(self) -> dict[str, Any]:
-        """Those of the entry."""
+        """The choices of its entry, with what was chosen."""
         return dict(self.chosen)
 
     def replaced(self, **values: Any) -> Named:
-        """With other values of parameters, or other choices."""
+        """The effect with other values of parameters, or other choices."""
         numbers = {name: as_number(values.get(name, old)) for name, old in self.values.items()}
         chosen = tuple((name, values.get(name, old)) for name, old in self.chosen)
         return dataclasses.replace(self, values=numbers, chosen=chosen)
 
     def standard_form(self) -> Named:
-        """Sizes of polar pairs positive, angles in (−π, π] or, of an axis, [0°, 180°)."""
+        """The effect with positive sizes of polar pairs and angles in (−π, π] or, for an axis, [0°, 180°)."""
         if (polar := self.entry.polar) is None:
             return self
         size, angle = float(self.values[polar.name]), float(self.values[polar.polar])
@@ -230,7 +233,7 @@ class Named(Effect):
         return self.replaced(**{polar.name: abs(size), polar.polar: phase / polar.turns})
 
     def lacks(self, instrument: Instrument) -> str:
-        """As for any effect; also where no star is available for a choice."""
+        """The part that the instrument lacks for the effect, in words; also where no star is available for a choice."""
         if "" in self.choices().values():
             return NO_STANDARD
         if not (arrangement := self.entry.arrangement):
@@ -241,7 +244,7 @@ class Named(Effect):
     # ------------------------------------------------------------------------------------ its action
 
     def patch(self, instrument: Instrument) -> Instrument:
-        """All changes at their sizes."""
+        """The instrument with all changes at their sizes."""
         if self.entry.arrangement:
             return changed(instrument, self.entry.arrangement)
         terms = [
@@ -330,7 +333,7 @@ def _expanded(text: str, instrument: Instrument) -> Iterator[str]:
 
 def _behind(change: Change, instrument: Instrument) -> Change:
     """The same place relative to the element ahead of it, if any."""
-    if change.where != "ahead of" or change.kind.startswith("displacement"):
+    if change.relation != "ahead of" or change.kind.startswith("displacement"):
         return change
     arm, _, name = change.place.rpartition(".")
     path = next((candidate.path for candidate in instrument.arms if candidate.name == arm), instrument.path)
@@ -339,4 +342,4 @@ def _behind(change: Change, instrument: Instrument) -> Change:
     if not at or (polariser is not None and name == polariser.name):
         return change
     before = f"{arm}.{path[at - 1]}" if arm else path[at - 1]
-    return dataclasses.replace(change, where="behind", place=before)
+    return dataclasses.replace(change, relation="behind", place=before)

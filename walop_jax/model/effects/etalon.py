@@ -59,7 +59,7 @@ class Etalon(Effect):
 
     @classmethod
     def probes(cls, context: Context) -> tuple[tuple[Self, ...], ...]:
-        """Pairs of gaps a quarter of a fringe apart."""
+        """Probes in pairs of gaps a quarter of a fringe apart."""
         return tuple(tuple(cls.of(context, gap=gap) for gap in pair) for pair in probed_gaps(context.units))
 
     @classmethod
@@ -76,7 +76,7 @@ class Etalon(Effect):
         return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
-        """The fringes of all plates together."""
+        """For the contrast, the fringes of all plates together."""
         gap = f"gap {float(self.gap)!r}"
         return (tuple((1.0, Change("fringes", "of", p, (gap,))) for p in instrument.places(WavePlate)),)
 

@@ -39,7 +39,10 @@ NUMBER = r"(-?\d*\.?\d+|-?\d+\.)"
 
 @dataclasses.dataclass(frozen=True)
 class Factor:
-    """One factor; `form` is the first word of a text with numbers or names, `given` holds these."""
+    """One factor of a change, such as `hours` or `cos 2 CLP`.
+
+    `form` is the first word of a text with numbers or names, and `given` holds these numbers and names.
+    """
 
     text: str
     depends_on: str
@@ -50,7 +53,7 @@ class Factor:
     given: tuple[str, ...] = ()
 
     def in_words(self, units: Units) -> str:
-        """Its words, with the scales of an instrument."""
+        """The words of the factor, with the scales of an instrument."""
         return self.words.replace(FIELD_UNIT, f"{units.field:g}").replace(WAVE, f"{units.wavelength:g}")
 
 
@@ -70,7 +73,7 @@ def _wave(at: Any, _: Units, wave: str, order: str, prefix: str) -> Any:
 
 
 def _side(at: Any, _: Units, prefix: str) -> Any:
-    """1 where a moving element came from smaller angles, −1 where from larger ones, 0 where it did not move."""
+    """1 where a moving element came from smaller angles, −1 where it came from larger ones, 0 where it did not move."""
     angle = at.angle(prefix)
     xp: Any = np if isinstance(angle, np.ndarray) else jnp
     hours = xp.broadcast_to(at.hours, angle.shape)

@@ -100,7 +100,7 @@ class FreeShares(ExposurePart):
         return 1.0 + self.gains if self.gains.size else 1.0
 
     def share(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e k"] | float:
-        """Addition in units of the response to unpolarised light."""
+        """Light (e, k) to add, in units of the response to unpolarised light."""
         if not (self.harmonics.size or self.exposures.size):
             return 0.0
         total = jnp.zeros(())
@@ -132,12 +132,12 @@ class FreeForm(Effect):
 
     @classmethod
     def neutral(cls, context: Context) -> Self:
-        """All blocks, all zero."""
+        """The effect with all blocks, all coefficients 0."""
         return cls.of(context, blocks=BLOCKS)
 
     @classmethod
     def of(cls, context: Context, **values: Any) -> Self:
-        """The requested blocks, all zero. Raises ValueError for an unknown block."""
+        """The effect with the requested `blocks`, all coefficients 0. Raises ValueError for an unknown block."""
         blocks = tuple(values.pop("blocks", BLOCKS))
         for name in [*blocks, *values]:
             if name not in BLOCKS:

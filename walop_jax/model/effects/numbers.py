@@ -14,9 +14,9 @@ from walop_jax.model.effects.change import (
     SKY,
     SLOW,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     SlotTerm,
     Term,
     add,
@@ -44,7 +44,7 @@ _FIELD = ("even", "tilt", "r2")
 
 
 def _with_ray(instrument: Instrument, change: Change) -> Grows:
-    """Plates: with the quantities of a ray, and with their own angle."""
+    """What changes of plates may grow with: quantities of a ray, and the angle of the plate itself."""
     holders = [p for p in instrument.places(WavePlate) if f"{change.place}.".startswith(f"{p}.")]
     moves = instrument.element(holders[0]).moves if holders else None
     tried = (
@@ -58,9 +58,9 @@ def _with_ray(instrument: Instrument, change: Change) -> Grows:
 
 
 def _number(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Add to a number with the name of the kind: of the polariser, of a wave plate or of one of its layers.
+    """Add to the number that has the name of the kind: of the polariser, of a wave plate or of one of its layers.
 
-    With factors, that of a plate grows.
+    With factors, the number of a plate grows with the conditions (`wave_plate.Grown`).
     """
     for change, size in terms:
         if not change.factors:
@@ -83,12 +83,15 @@ def _of_instrument(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _patches(change: Change) -> Hashable:
-    """All patches of the sky together."""
+    """The key by which all changes of patches of the sky are patched together."""
     return SKY if change.place == SKY and change.kind != "polarisation" else change
 
 
 def _polarised(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    """Of a star: Q + a, or U, in the equatorial frame; of the Moon sky: its degree; q or u in one exposure."""
+    """Add to the polarisation of a source.
+
+    For a star: Q or U in the equatorial frame; for the Moon sky: its degree, or q or u in one exposure.
+    """
     change, size = terms[0]
     if change.place != SKY:
         return _of_star(instrument, terms)
@@ -132,7 +135,7 @@ def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 class GrownStandard(Component):
-    """Change of q (axis 0) or u (1) of one value of a standard with time, or from filter to filter."""
+    """A change of q (`axis` 0) or u (1) of one value of a standard with time, or from filter to filter."""
 
     size: Scalar
     value: int = eqx.field(static=True)
@@ -140,36 +143,38 @@ class GrownStandard(Component):
     change: Change = eqx.field(static=True)
 
     def factor(self, exposures: ExposureArrays) -> Float[Array, " e"]:
-        """The product of its factors."""
+        """The product of its factors in every exposure (e)."""
         return in_exposures(self.change, exposures)
 
 
 def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    """Slots of the light: q or u of a star with its number in the list."""
+    """Slots of the light: q or u of a star, by the number of the star in the list."""
     names = [name.replace(" ", "_") for name in instrument.standard.names]
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
-    return [SlotTerm(("light", change.kind, change.where, place, *star), 1.0, change.factors)]
+    return [SlotTerm(("light", change.kind, change.relation, place, *star), 1.0, change.factors)]
 
 
 NUMBERS = {"axis": "angle", "cut": "angle", "thickness": "length", "thermal": "number"}
 """Numbers of wave plates and of their layers (µm, deg), with their amplitudes."""
 KINDS |= {
-    name: Kind(amplitude, _number, grows=_with_ray, slots=itself("number"))
+    name: ChangeKind(amplitude, _number, grows=_with_ray, slots=itself("number"))
     for name, amplitude in NUMBERS.items()
 }
 OF_POLARISER = ("extinction", "ellipticity")
-KINDS |= {name: Kind("share", _number, slots=itself("light")) for name in OF_POLARISER}
+KINDS |= {name: ChangeKind("share", _number, slots=itself("light")) for name in OF_POLARISER}
 _OF_BAND = "narrow bands beside the broad one"  # filters wider than `light.BROAD` are displaced
 _ALONE = Grows(tried=(Combinations(),))
-KINDS["shift"] = Kind(
+KINDS["shift"] = ChangeKind(
     "wavelength", _of_instrument, test=_OF_BAND, grows=lambda *_: _ALONE, slots=itself("whole")
 )
 _OF_ROTATOR = "a polariser aligned in the laboratory: an independent zero of the angle"
-KINDS["degree"] = Kind("share", _of_instrument, test="standards of another catalogue", slots=itself("light"))
-KINDS["rotator"] = Kind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
+KINDS["degree"] = ChangeKind(
+    "share", _of_instrument, test="standards of another catalogue", slots=itself("light")
+)
+KINDS["rotator"] = ChangeKind("angle", _of_instrument, test=_OF_ROTATOR, slots=itself("light"))
 _OF_SOURCE = "the same patch or star again at another ROTATOR angle"
 KINDS |= {
-    name: Kind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
+    name: ChangeKind("share", _polarised, _patches, _OF_SOURCE, _of_patch, slots=_slots_of_source)
     for name in OF_SOURCES
 }

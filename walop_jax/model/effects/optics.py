@@ -3,7 +3,7 @@
 Equation    M → M_Δ M_R M_D M at one place of the train, with
             M_R = exp Σ r_i G_i (a retarder), M_D the diattenuator of vector d, M_Δ = diag(1, k_q, k_u, k_v)
 Symbols     r, d sums of amplitude × factor along q, u, v; radial: x² − y² along q, 2xy along u (in units of the field);
-            diagonal: −2xy and x² − y²; k = 1 − its lost share; a turn by α is r_v = −2α
+            diagonal: −2xy and x² − y²; k = 1 − its lost fraction; a turn by α is r_v = −2α
 Source      Lu & Chipman 1996, JOSA A 13, 1106: every Mueller matrix near the identity is such a product
 Limits      exact for one kind at a place; the order of several kinds matters at second order
 """
@@ -27,9 +27,9 @@ from walop_jax.model.effects.change import (
     SLOW,
     AtPoint,
     Change,
+    ChangeKind,
     Combinations,
     Grows,
-    Kind,
     Scalar,
     SlotTerm,
     Term,
@@ -83,7 +83,7 @@ def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
 
 def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
     """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg)."""
-    sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the share that is lost
+    sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the fraction that is lost
     for change, size in terms:
         for name, coefficient, factors in generators_of(change.kind):
             by = coefficient * product(factors, AtPoint(x, y), change.units)
@@ -132,15 +132,18 @@ class Terms(Element):
     kind: ClassVar[str] = "described"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """All of them."""
+        """Mueller matrices of all the changes together at the wavelengths of a ray."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
         return matrix_of(sizes, ray.x, ray.y)
 
 
 class Film(Component):
-    """Changes of light that vary from exposure to exposure: of that from the sky, ahead of the polariser, or of that
-    behind the polariser, at its angle and only when it is in."""
+    """Changes of light that vary from exposure to exposure, ahead of the polariser or behind it.
+
+    Ahead of the polariser they act on light from the sky; behind it they act at the angle of the polariser, and only
+    when it is in.
+    """
 
     amplitudes: tuple[Scalar, ...]
     changes: tuple[Change, ...] = eqx.field(static=True)
@@ -148,7 +151,7 @@ class Film(Component):
     def through(
         self, light: Float[Array, "e 4"], exposures: ExposureArrays, x: Scalar, y: Scalar
     ) -> Float[Array, "e 4"]:
-        """Stokes vectors behind it at a field point, one per exposure."""
+        """Stokes vectors (e, 4) behind the film at a field point, one for each exposure."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
         acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
@@ -167,7 +170,7 @@ class Inside:
     prefix: str
 
     def __call__(self, at: Any) -> Any:
-        """Its value in every exposure."""
+        """Its value (e), 0 or 1, in every exposure."""
         return np.isfinite(at.angle(self.prefix)) * 1.0
 
 
@@ -198,7 +201,7 @@ def with_air_gap(instrument: Instrument, place: str, contrast: Scalar, gap: Scal
 
 
 def _at(change: Change) -> Hashable:
-    return change.where, change.place
+    return change.relation, change.place
 
 
 def _columns(terms: Sequence[Term]) -> dict[str, Any]:
@@ -206,9 +209,9 @@ def _columns(terms: Sequence[Term]) -> dict[str, Any]:
     return {"changes": changes, "amplitudes": amplitudes}
 
 
-def beside(instrument: Instrument, element: Element, where: str, place: str) -> Instrument:
-    """The instrument with one more element ahead of another one, or behind it."""
-    return instrument.inserted(element, **{"before" if where == "ahead of" else "after": place})
+def beside(instrument: Instrument, element: Element, relation: str, place: str) -> Instrument:
+    """The instrument with `element` added "ahead of" or "behind" the element `place`; `relation` says which."""
+    return instrument.inserted(element, **{"before" if relation == "ahead of" else "after": place})
 
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
@@ -229,7 +232,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     if _is_ahead(instrument, change):
         single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
         return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
-    if change.where != "of":
+    if change.relation != "of":
         further = (
             Combinations(over, ("colour",)),
             Combinations(along=OF_RAY),
@@ -248,9 +251,9 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
 
 
 def _is_ahead(instrument: Instrument, change: Change) -> bool:
-    """True for changes of light from the sky alone, ahead of the polariser."""
+    """True for a change of light from the sky alone, ahead of the polariser."""
     polariser = instrument.polariser
-    return polariser is not None and change.where == "ahead of" and change.place == polariser.name
+    return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
 
 
 def _with_sky_film(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
@@ -263,23 +266,23 @@ def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
     if with_exposure and _is_ahead(instrument, change):
         return _with_sky_film(instrument, terms)
-    if change.where == "of" and polariser is not None and change.place == polariser.name:
+    if change.relation == "of" and polariser is not None and change.place == polariser.name:
         return instrument.changed(change.place, films=lambda films: (*films, Film(**_columns(terms))))
-    moves = instrument.element(change.place).moves if change.where == "of" else None
+    moves = instrument.element(change.place).moves if change.relation == "of" else None
     element = Terms(name="described", moves=moves, **_columns(terms))
-    return beside(instrument, element, change.where, change.place)
+    return beside(instrument, element, change.relation, change.place)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """Generators at a place of the train, also growing with the wavelength; at the polariser: of the light."""
     polariser, factors, stage, colour = instrument.polariser, change.factors, "light", ()
-    if polariser is None or change.place != polariser.name or change.where == "behind":
+    if polariser is None or change.place != polariser.name or change.relation == "behind":
         stage, colour = "inserted", (factors.count("colour"),)
         factors = tuple(item for item in factors if item != "colour")
-        moves = instrument.element(change.place).moves if change.where == "of" else None
+        moves = instrument.element(change.place).moves if change.relation == "of" else None
         factors = factors if moves is None else (*factors, Inside(moves))
     return [
-        SlotTerm((stage, kind, change.where, change.place, *colour), size, (*factors, *extra))
+        SlotTerm((stage, kind, change.relation, change.place, *colour), size, (*factors, *extra))
         for kind, size, extra in generators_of(change.kind)
     ]
 
@@ -292,7 +295,7 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
     element = AddedPolarisation(name="described", **components)
-    return beside(instrument, element, terms[0][0].where, terms[0][0].place)
+    return beside(instrument, element, terms[0][0].relation, terms[0][0].place)
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
@@ -325,12 +328,13 @@ _OPTICAL = {f"retardance {axis}": "retardance" for axis in AXES} | {"turn": "ang
 _OPTICAL |= {f"diattenuation {axis}": "share" for axis in AXES}
 _OPTICAL |= {f"depolarisation{axis}": "share" for axis in ("", " q", " u", " v")}
 KINDS |= {
-    name: Kind(amplitude, _optics, _at, grows=_grows, slots=_slots) for name, amplitude in _OPTICAL.items()
+    name: ChangeKind(amplitude, _optics, _at, grows=_grows, slots=_slots)
+    for name, amplitude in _OPTICAL.items()
 }
-KINDS |= {name: Kind("share", _added, _at, grows=_grows_added, slots=itself("light")) for name in ADDED}
+KINDS |= {name: ChangeKind("share", _added, _at, grows=_grows_added, slots=itself("light")) for name in ADDED}
 _OF_FIELD = "the same angles at several hour angles, and a star at known pixels in each"
 KINDS |= {
-    name: Kind(
+    name: ChangeKind(
         "displacement",
         _displaced,
         lambda change: change.place,
@@ -341,7 +345,7 @@ KINDS |= {
     for name in DISPLACEMENTS
 }
 _OF_FRINGES = "narrow bands a nanometre apart, or the same band at another temperature"
-KINDS["fringes"] = Kind(
+KINDS["fringes"] = ChangeKind(
     "share",
     _fringes,
     test=_OF_FRINGES,

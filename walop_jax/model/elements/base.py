@@ -1,7 +1,7 @@
-"""Elements of the train: each maps a ray to a ray and has a Mueller matrix for it.
+"""Elements of the train: each maps a ray to the ray behind it, and has a Mueller matrix for that ray.
 
-An element without numbers is neutral. It may move: `moves` is the prefix of its columns in EXPOSURES (`CHWP` for
-CHWP_IN and CHWP_ANGLE), its presence in the beam and its angle.
+An element all of whose numbers are left at their defaults changes nothing. An element may move: `moves` is then the
+prefix of its columns in EXPOSURES (`CHWP` for CHWP_IN and CHWP_ANGLE), its presence in the beam and its angle.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.text import with_minus_sign
 from walop_jax.model.parameters import Component, Parameter
 from walop_jax.model.ray import Ray
 
@@ -28,9 +29,10 @@ class Element(Component):
     `declared` holds the parameters of the instrument among its numbers, by field. `path_difference` (µm) is the largest
     optical path between interfering waves: the wavelength nodes must follow its fringes.
 
-    `period` is the change of a reading (the number in `<P>_ANGLE`) after which an element that moves acts as before:
-    360 for an angle in degrees, None for a reading that never repeats itself, such as a voltage. A class that writes
-    `turned` or `position` anew and says nothing of its period has None, which is right for every reading.
+    A reading is the number in `<P>_ANGLE` of an element that moves. `reading_unit` is its unit in print: "deg", or "V"
+    for a voltage. `period` is the change of a reading after which the element acts as before: 360 for an angle in
+    degrees, None for a reading that never repeats itself, such as a voltage. A class that writes `turned` or `position`
+    anew and says nothing of unit and period has no unit and the period None, which is right for every reading.
 
     >>> class Dimmer(walop.Element):
     ...     "A filter that is grey."
@@ -49,13 +51,21 @@ class Element(Component):
     kind: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     period: ClassVar[float | None] = 360.0
+    reading_unit: ClassVar[str] = "deg"
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Nothing is known of the period of a class that gives readings a meaning of its own."""
+        """Nothing is known of unit and period of a class that gives readings a meaning of its own."""
         super().__init_subclass__(**options)
         own = vars(cls)
-        if "period" not in own and ("turned" in own or "position" in own):
-            cls.period = None
+        if "turned" in own or "position" in own:
+            cls.period = own.get("period")
+            cls.reading_unit = own.get("reading_unit", "")
+
+    @classmethod
+    def reading_in_words(cls, reading: float) -> str:
+        """A reading with its unit: 45°, 5 V, or the number alone."""
+        text = with_minus_sign(f"{reading:g}")
+        return f"{text}°" if cls.reading_unit == "deg" else f"{text} {cls.reading_unit}".rstrip()
 
     def ray(self, ray: Ray) -> Ray:
         """The ray behind the element."""
@@ -67,9 +77,10 @@ class Element(Component):
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[Any, Ray]]) -> list[Mueller | None]:
-        """Mueller matrices of several elements of this class; overridden where a joint solution is faster.
+        """Mueller matrices of several elements of this class, each for its ray, in the order of `cases`.
 
-        One element at many angles is traced once: an instrument with many settings would take minutes otherwise.
+        A class overrides it where a joint solution is faster. One element at many angles is traced once: an instrument
+        with many settings would take minutes otherwise.
         """
         result: list[Mueller | None] = [None] * len(cases)
         copies: dict[tuple[int, ...], list[int]] = {}  # of one element at different angles in the same ray
@@ -95,23 +106,24 @@ class Element(Component):
         return dataclasses.replace(self, axis=self.axis + jnp.asarray(angle, float))  # pyright: ignore
 
     def position(self, angle: float | None) -> float | None:
-        """True angle (deg) for a recorded `angle`, None when out of the beam."""
+        """The true angle (deg) of the element for a reading `angle`; None when it is out of the beam."""
         return angle
 
     @property
     def path_difference(self) -> float:
-        """See the class."""
+        """Largest optical path (µm) between interfering waves in this element; 0 where none interfere."""
         return 0.0
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Names of the materials with a refractive index in it."""
+        """Names of the materials whose refractive index this element uses, such as ("quartz", "mgf2")."""
         return ()
 
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-        """Retardance along the axis at wavelengths (µm), in waves, and the sum over all layers; empty: no waves.
+        """Net retardance along the fast axis at some wavelengths (µm), in waves, and the sum over all layers of its
+        magnitude.
 
-        The difference of crossed layers interferes at full strength. Single layers do for oblique rays alone,
-        hundreds of times more weakly.
+        An empty tuple comes back if the element makes no fringes. The net retardance of crossed layers interferes at
+        full strength; single layers interfere for oblique rays alone, hundreds of times more weakly.
         """
         return ()

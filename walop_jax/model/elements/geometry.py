@@ -26,8 +26,9 @@ from jaxtyping import Array, Float
 from walop_jax.io.errors import nearest
 from walop_jax.model import materials, mueller
 from walop_jax.model.elements.base import Element, Mueller
+from walop_jax.model.mueller import Real
 from walop_jax.model.parameters import Scalar, number
-from walop_jax.model.ray import Ray, Real
+from walop_jax.model.ray import Ray
 
 
 def pupil_direction(
@@ -74,7 +75,7 @@ FRAMES = ("kept", "turned")
 
 
 class PupilMapping(Element):
-    """From the field point to the direction of the collimated beam."""
+    """The mapping from the field point to the direction of the collimated beam, in the pupil."""
 
     magnification: Scalar = number("", "field-to-pupil magnification", default=1.0)
     distortion: Scalar = number("deg-2", "cubic distortion")
@@ -84,7 +85,7 @@ class PupilMapping(Element):
     reference: ClassVar[str] = "Maharana et al. 2022, Paper II, appendix B"
 
     def ray(self, ray: Ray) -> Ray:
-        """The collimated ray."""
+        """The ray behind the collimator."""
         kx, ky, _ = pupil_direction(
             ray.x, ray.y, self.magnification, self.distortion, 0.0 if self.aspect is None else self.aspect
         )
@@ -117,12 +118,12 @@ class Wedge(Element):
             raise ValueError(f"frame = {self.frame!r} of a wedge must be {' or '.join(FRAMES)}")
 
     def labels(self, field: str) -> tuple[str, ...]:
-        """The angle has the name of the wedge."""
+        """The parameter `angle` has the name of the wedge itself."""
         return ("",) if field == "angle" else (field,)
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """The glass."""
+        """The glass of the wedge."""
         return (self.material,)
 
     def ray(self, ray: Ray) -> Ray:
@@ -138,7 +139,7 @@ class Wedge(Element):
 
     @property
     def turn(self) -> Scalar:
-        """The angle with its sign."""
+        """The wedge angle (rad) with its sign, `sense` × `angle`."""
         return self.angle if self.sense == 1.0 else self.sense * self.angle
 
     def index(self, ray: Ray) -> Float[Array, ...]:

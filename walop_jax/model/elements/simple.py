@@ -37,12 +37,12 @@ class Retarder(Element):
     reference: ClassVar[str] = "Maharana et al. 2022, Paper II, appendix B"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The retarder."""
+        """Mueller matrix (4, 4), or (n, 4, 4) at n wavelengths, of the retarder."""
         delta = self.delta if self.wavelength is None else self.delta * self.wavelength / ray.wavelength
         return mueller.retarder(delta, jnp.deg2rad(self.axis))
 
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-        """One retardance."""
+        """The retardance in waves at wavelengths (µm), net and in sum alike; empty if it is achromatic."""
         if self.wavelength is None:
             return ()
         waves = float(self.delta) / (2.0 * np.pi) * float(self.wavelength) / wavelength
@@ -64,7 +64,7 @@ class Rotator(Element):
     reference: ClassVar[str] = "Chipman, Lam & Young 2018, Polarized Light and Optical Systems, ch. 17"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The rotation."""
+        """Mueller matrix (4, 4) of the rotation for the direction of a ray."""
         return mueller.rotation(jnp.deg2rad(self.angle) + self.skew * ray.kx * ray.ky)
 
 
@@ -79,23 +79,23 @@ class Diattenuator(Element):
     reference: ClassVar[str] = "Lu & Chipman 1996, JOSA A 13, 1106"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The diattenuator."""
+        """Mueller matrix (4, 4) of the diattenuator."""
         twice = 2.0 * jnp.deg2rad(self.axis)
         cos, sin = jnp.cos(twice), jnp.sin(twice)
         return mueller.diattenuator(self.q * cos - self.u * sin, self.q * sin + self.u * cos)
 
 
 class Depolariser(Element):
-    """Depolarisation: a share of the polarisation is lost, of the linear and of the circular part."""
+    """Depolarisation: a fraction of the polarisation is lost, of the linear and of the circular part."""
 
-    linear: Scalar = number("", "share of q and u that is lost")
-    circular: Scalar = number("", "share of v that is lost")
+    linear: Scalar = number("", "fraction of q and u that is lost")
+    circular: Scalar = number("", "fraction of v that is lost")
 
     kind: ClassVar[str] = "depolariser"
     reference: ClassVar[str] = "Lu & Chipman 1996, JOSA A 13, 1106"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The depolariser."""
+        """Mueller matrix (4, 4) of the depolariser, diagonal."""
         remaining = 1.0 - self.linear
         return jnp.diag(jnp.stack([jnp.ones_like(remaining), remaining, remaining, 1.0 - self.circular]))
 
@@ -141,7 +141,7 @@ class AnalysisVector(Element):
     reference: ClassVar[str] = "Azzam 1985, Opt. Acta 32, 1407"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """The row, with unpolarised light behind it."""
+        """Mueller matrix (4, 4) with the analysis vector as its first row; the light behind it is unpolarised."""
         row, angle = jnp.stack([jnp.ones_like(self.q), self.q, self.u, self.v]), jnp.deg2rad(self.axis)
         for name in FOLLOWING:
             if (change := getattr(self, name)) is not None:
@@ -155,7 +155,7 @@ class AnalysisVector(Element):
                 raise ValueError(f"{name} has {len(change)} values; one each for I, Q, U and V is needed")
 
     def labels(self, field: str) -> Sequence[str]:
-        """Elements of a change have the names of their Stokes parameters."""
+        """Elements of a row are called after their Stokes parameters: `camera1.cos1.q`."""
         return tuple(f"{field}.{component}" for component in "iquv") if field in FOLLOWING else (field,)
 
 
@@ -163,7 +163,7 @@ class AnalysisVector(Element):
 
 
 class Polariser(Element):
-    """A polariser whose axis is read from an encoder: light behind it forgets its past.
+    """A polariser whose axis is read from an encoder: the light behind it is independent of the incoming polarisation.
 
     Equation    light behind it (1, c cos 2θ, c sin 2θ, v), c = (1 − ε)/(1 + ε), per unit of transmitted light
                 θ = reading + zero
@@ -182,7 +182,7 @@ class Polariser(Element):
     reference: ClassVar[str] = "Goldstein 2003, Polarized Light, ch. 9"
 
     def light(self, exposures: ExposureArrays, x: Scalar, y: Scalar) -> Float[Array, "e 4"]:
-        """Stokes vectors behind it at a field point, per unit of transmitted light, one per exposure."""
+        """Stokes vectors (e, 4) behind the polariser at a field point, per unit of transmitted light."""
         angle = exposures.clp_angle if self.zero is None else exposures.clp_angle + jnp.deg2rad(self.zero)
         behind = mueller.polarised(angle, self.extinction)
         if self.ellipticity is not None:
@@ -214,7 +214,7 @@ class Collimator(Element):
     reference: ClassVar[str] = PAPER_II
 
     def mueller(self, ray: Ray) -> Mueller:
-        """A non-depolarising diattenuator."""
+        """Mueller matrix (4, 4) of the diattenuation at the field point of a ray."""
         q = self.diattenuation * (ray.x**2 - ray.y**2) + self.q
         u = self.diattenuation * 2.0 * ray.x * ray.y + self.u
         return mueller.diattenuator(q, u)
@@ -239,7 +239,7 @@ class RadialRetarder(Element):
     reference: ClassVar[str] = "Selbing 2010, arXiv:1010.4142; Patat & Romaniello 2006, PASP 118, 146"
 
     def mueller(self, ray: Ray) -> Mueller:
-        """A linear retarder, smooth at the centre of the field."""
+        """Mueller matrix (4, 4), or (n, 4, 4) where it depends on wavelength; smooth at the centre of the field."""
         x, y, delta = ray.x, ray.y, self.delta
         if self.slope is not None:
             delta = delta + self.slope * (ray.wavelength - REFERENCE_WAVELENGTH)
@@ -266,8 +266,9 @@ class Analyser(WithCurves):
     Limits      no balance, no loss: as if g = l = 0
                 η = 1, α = 0 are ideal analysers along +X and +Y; κ = 0: both see the filter as it is.
 
-    The dependence on the light ahead of it (`seen`) is separate from the `shares`, which do not depend on it: only the
-    first enters the band integral.
+    Two methods make the beams. `seen` takes the rows of the Mueller matrix ahead of the analyser that its beams are
+    made of; they depend on wavelength and enter the band integral. `beam_weights` holds the coefficients with which
+    each beam adds these rows; they do not depend on the light, and multiply afterwards.
     """
 
     efficiency: Scalar = number("", "η of the analysers ½(1, ±η, 0, 0)", default=1.0)
@@ -275,7 +276,7 @@ class Analyser(WithCurves):
     angle: Scalar | None = number("deg", "rotation of the analysers", default=None)
     dispersion: Scalar | None = number("", "κ, first beam at λ (1 + κ), second at λ (1 − κ)", default=None)
     balance: Curve | None = row("", "half the relative difference of the beams at `balance_at`")
-    loss: Curve | None = row("", "share of the polarisation lost at `loss_at`")
+    loss: Curve | None = row("", "fraction of the polarisation lost at `loss_at`")
     balance_at: tuple[float, ...] = eqx.field(static=True, default=())
     loss_at: tuple[float, ...] = eqx.field(static=True, default=())
     cameras: tuple[str, ...] = eqx.field(static=True, default=())
@@ -303,16 +304,18 @@ class Analyser(WithCurves):
             total, analysed = total + g * analysed, analysed + g * total
         return jnp.stack([total, analysed], axis=1)
 
-    def shares(self) -> Float[Array, "k 2"]:
-        """Share of `seen` in each beam; a single camera has the first beam alone."""
+    def beam_weights(self) -> Float[Array, "k 2"]:
+        """Coefficients (k, 2) with which each beam adds the two rows of `seen`; a single camera has the first beam
+        alone.
+        """
         half = 0.5 * jnp.ones_like(self.efficiency)
         extra = jnp.zeros_like(half) if self.contrast is None else 0.5 * self.contrast
         along = 0.5 * self.efficiency
         beams = jnp.stack([jnp.stack([half, along + extra]), jnp.stack([half, extra - along])])
         return beams[: len(self.cameras)] if self.cameras else beams
 
-    def shares_of_slopes(self) -> Float[Array, "k 2"]:
-        """Share of λ ∂/∂λ of `seen` in each beam."""
+    def beam_weights_of_slopes(self) -> Float[Array, "k 2"]:
+        """Coefficients (k, 2) with which each beam adds λ ∂/∂λ of the two rows of `seen`; 0 without dispersion."""
         kappa = jnp.zeros_like(self.efficiency) if self.dispersion is None else self.dispersion
-        shares = self.shares()
-        return shares * jnp.stack([kappa, -kappa])[: len(shares), None]
+        weights = self.beam_weights()
+        return weights * jnp.stack([kappa, -kappa])[: len(weights), None]

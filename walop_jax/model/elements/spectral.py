@@ -6,7 +6,7 @@ Equation    M = depolariser(loss) · R(ρ) · [diattenuator(D) spread(s) retarde
             `FieldDiattenuator`: D(x, y, λ) = Σ c_ij(λ) P_i(x/h) P_j(y/h), i + j ≤ 2, along `axis`, c_ij(λ) such splines
 Symbols     δ retardance [rad], of the fast axis; D diattenuation along `axis`; ρ rotation [deg] of the polarisation
             from +X toward +Y, a circular retardance of 2ρ (skew mirrors, optical activity);
-            loss lost share of q, u, v; s lost share of the components not along `axis`, 1 − exp(−σ²/2) for a rms
+            loss lost fraction of q, u, v; s lost fraction of the components not along `axis`, 1 − exp(−σ²/2) for a rms
             spread σ [rad] of the retardance over the beam or the band
 Sources     mirrors as diattenuating retarders: van Harten, Snik & Keller 2009, PASP 121, 377; form of M: Lu & Chipman
             1996, JOSA A 13, 1106; diattenuation of oblique faces (Fresnel): Born & Wolf 1999, § 1.5;
@@ -47,12 +47,12 @@ class WithCurves(Element):
                 check_curve(name, getattr(self, name), getattr(self, knots.name))
 
     def labels(self, field: str) -> Sequence[str]:
-        """Values of a curve are numbered from 1, by wavelength."""
+        """Values of a curve are numbered from 1 in the order of their wavelengths: `mirror.delta.1`."""
         knots = getattr(self, f"{field}_at", None)
         return (field,) if knots is None else tuple(f"{field}{i + 1}" for i in range(len(knots)))
 
     def curve(self, name: str, wavelength: Float[Array, " n"]) -> Float[Array, " n"]:
-        """One of the curves, at wavelengths (µm)."""
+        """Values (n) of one of the curves at n wavelengths (µm), in the unit of the curve."""
         return spline(getattr(self, f"{name}_at"), getattr(self, name), wavelength)
 
 
@@ -89,7 +89,7 @@ class SpectralElement(WithCurves):
     delta: Curve | None = row("rad", "retardance at `delta_at`")
     diattenuation: Curve | None = row("", "diattenuation along the axis at `diattenuation_at`")
     rotation: Curve | None = row("deg", "turn of the polarisation at `rotation_at`")
-    loss: Curve | None = row("", "share of the polarisation lost at `loss_at`")
+    loss: Curve | None = row("", "fraction of the polarisation lost at `loss_at`")
     spread: Curve | None = row("", "share lost across the axis at `spread_at`")
     axis: Scalar = number("deg", "fast axis, from +X toward +Y")
     delta_at: tuple[float, ...] = eqx.field(static=True, default=())
@@ -166,7 +166,9 @@ class FieldDiattenuator(Element):
         return tuple(f"{field}_{i + 1}" for i in range(len(self.at))) if field in FIELD_TERMS else (field,)
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """The diattenuator at every wavelength; the identity without terms."""
+        """Mueller matrices (n, 4, 4) of the diattenuator at the wavelengths of a ray; None, the identity, without
+        terms.
+        """
         terms = legendre.basis(ray.x, ray.y, 2, self.scale)
         knots, gap = self.at, len(self.at)
         if self.none_at > 0.0:
@@ -211,7 +213,10 @@ class Mirror(WithCurves):
             raise ValueError(f"{'n' if self.n is None else 'k'} is missing: a metal has both")
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """The mirror at every wavelength, of unit mean reflectance; no metal: nothing."""
+        """Mueller matrices (n, 4, 4) of the mirror at the wavelengths of a ray, of unit mean reflectance.
+
+        None, the identity, comes back for a mirror without a metal.
+        """
         if self.n is None or self.k is None:
             return None
         index = self.curve("n", ray.wavelength) + 1j * self.curve("k", ray.wavelength)

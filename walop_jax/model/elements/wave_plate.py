@@ -1,6 +1,6 @@
 """Wave plates: crystal layers in contact, solved as plane waves (equations: `plates`).
 
-Layers      optic axis of a layer at fast axis + axis, out of its surface by cut.
+Layers      the optic axis of a layer has the azimuth fast axis + axis and leaves the surface by the angle cut.
 Dispersion  n_e − n_o → (n_e − n_o) (1 + a u + b u² + c u³), u = λ − 0.62 µm: difference of a crystal, or of the
             catalogue of a design program, from the published curve; at 0.62 µm it is degenerate with thickness.
 Thermal     n_e − n_o → (n_e − n_o) (1 − thermal · b · (T − 10 °C)), b the published change per kelvin.
@@ -29,8 +29,9 @@ from walop_jax.model.compiled import need_float64
 from walop_jax.model.conventions import REFERENCE_WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
 from walop_jax.model.materials import REFERENCE_TEMPERATURE
+from walop_jax.model.mueller import Real
 from walop_jax.model.parameters import Component, Parameter, Scalar, number
-from walop_jax.model.ray import Conditions, Ray, Real
+from walop_jax.model.ray import Conditions, Ray
 
 Known = dict[tuple[str, int], tuple[Real, Real]]
 """Ordinary and extraordinary indices by crystal and array of wavelengths (its `id`, while the rays live)."""
@@ -40,9 +41,10 @@ MODELS = {"waves": plates.stack_mueller, "fixed_axis": plates.fixed_axis_mueller
 
 
 class Grown(Component):
-    """A change of a number (the `kind` of `change`) by `size` × the factors of `change`.
+    """A change of a number of a plate that grows with the conditions: `size` × the factors of `change`.
 
-    `reading` is the angle (deg) of an element that moves.
+    `reading` is the angle (deg) at which a moving plate stands. Example: `axis of half1.plate * kelvin` adds `size`
+    degrees to the axis for every kelvin.
     """
 
     size: Scalar
@@ -79,12 +81,12 @@ class Layer(Component):
         return np.abs(birefringence * factor) * abs(float(self.thickness)) / wavelength
 
     def labels(self, field: str) -> tuple[str, ...]:
-        """The thickness has the name of the layer."""
+        """The parameter `thickness` has the name of the layer itself: `half1.plate.mgf2`."""
         return ("",) if field == "thickness" else (field,)
 
 
 class AirGap(Component):
-    """An air gap ahead of a plate, with fringes of polarised light."""
+    """An air gap ahead of a plate, which makes fringes of polarised light."""
 
     contrast: Scalar = number("", "diattenuation at a maximum")
     gap: Scalar = number("um", "thickness of the air")
@@ -104,10 +106,11 @@ class WavePlate(Element):
 
     kind: ClassVar[str] = "wave_plate"
     period: ClassVar[float | None] = 360.0  # its own `turned` keeps the reading for factors of that angle
+    reading_unit: ClassVar[str] = "deg"
     reference: ClassVar[str] = "Born & Wolf, Principles of Optics, ch. 15; Yeh 1980, Surf. Sci. 96, 41"
 
     def turned(self, angle: float) -> Self:
-        """The plate turned, with the readings of its growing numbers."""
+        """The plate turned by `angle` (deg); numbers that grow with a reading get that reading."""
         plate = super().turned(angle)
         if not any(component.grown for component in (self, *self.layers)):
             return plate
@@ -115,21 +118,26 @@ class WavePlate(Element):
         return dataclasses.replace(plate, grown=_read_at(self, angle), layers=layers)
 
     def position(self, angle: float | None) -> float | None:
-        """At 0° where it is always in the beam in spite of a header that reports it out."""
+        """The angle (deg) of the plate for a reading; 0 for a plate that is always in the beam, whatever the header
+        says.
+        """
         return 0.0 if angle is None and self.always_in else angle
 
     @property
     def path_difference(self) -> float:
-        """Of the air gaps: there and back."""
+        """Twice the thickest air gap (µm): light goes there and back."""
         return 2.0 * max((gap.longest for gap in self.air_gaps), default=0.0)
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """The crystals."""
+        """The crystals of the layers."""
         return tuple(layer.material for layer in self.layers)
 
     def retardances(self, wavelength: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-        """Retardance of the plate, layers across the first axis counted negative; and the sum of all layers."""
+        """Retardance of the plate in waves at wavelengths (µm), and the sum of the magnitudes of all layers.
+
+        Layers that lie across the first one count negative.
+        """
         waves = [layer.waves(wavelength) for layer in self.layers]
         if not waves:
             return ()
@@ -168,7 +176,7 @@ class WavePlate(Element):
         return tuple(crystals)
 
     def mueller(self, ray: Ray) -> Mueller | None:
-        """The plate with the air gap ahead of it."""
+        """Mueller matrices (n, 4, 4) of the plate with the air gaps ahead of it."""
         return self.solved([(self, ray)])[0]
 
     def retardance(
@@ -199,7 +207,10 @@ class WavePlate(Element):
 
     @classmethod
     def solved(cls, cases: Sequence[tuple[WavePlate, Ray]]) -> list[Mueller | None]:
-        """Plates with equal numbers of layers as rows of the same arrays: one computation, compiled once."""
+        """Mueller matrices of several plates, in the order of `cases`.
+
+        Plates with equal numbers of layers are rows of the same arrays: one computation, compiled once.
+        """
         result: list[Mueller | None] = [None] * len(cases)
         groups: dict[tuple[int, str], list[int]] = {}
         for i, (plate, _) in enumerate(cases):
@@ -218,7 +229,7 @@ class WavePlate(Element):
 
 
 def _number(part: WavePlate | Layer, name: str, ray: Ray) -> Any:
-    """A number of a plate or a layer for a ray; None where absent."""
+    """The value of a number of a plate or a layer for a ray, its growth included; None for an absent number."""
     value = getattr(part, name)
     for term in part.grown:
         if term.change.kind == name:
@@ -250,5 +261,5 @@ def _solved_together(cases: Sequence[tuple[WavePlate, Ray]], model: str) -> Floa
 
 
 def fringe(gap: Real, ray: Ray) -> Real:
-    """Fringes of air of some thickness (µm), 1 at a maximum."""
+    """Fringes of an air gap of some thickness (µm) at the wavelengths of a ray, 1 at a maximum."""
     return jnp.cos(4.0 * jnp.pi * gap * ray.kz / ray.wavelength)

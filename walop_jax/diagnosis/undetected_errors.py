@@ -36,7 +36,7 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import local_p, noncentrality
 from walop_jax.diagnosis.stated_conditions import Singles
-from walop_jax.fit.verdict import DATA, EFFECT, Hidden, Mistake
+from walop_jax.fit.verdict import DATA, EFFECT, Hidden, UndetectedError
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Effect
 from walop_jax.model.instrument import Instrument
@@ -65,7 +65,7 @@ class _Mistake(NamedTuple):
     acts: bool = False
 
 
-def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
+def undetected_errors(design: Design, singles: Singles) -> Hidden:
     """Single mistakes at the size detected with 99 % probability, and their consequences.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
@@ -97,7 +97,7 @@ def hidden_mistakes(design: Design, singles: Singles) -> Hidden:
     for i in order:
         m = mistakes[i]
         acts = as_text(m.effect) if m.effect is not None and i in acting else ""
-        hidden.append(Mistake(m.name, m.size, m.unit, m.kind, m.shown_by, acts, i not in unseen))
+        hidden.append(UndetectedError(m.name, m.size, m.unit, m.kind, m.shown_by, acts, i not in unseen))
     return Hidden(tuple(hidden), changes[order])
 
 
