@@ -85,7 +85,7 @@ def _slopes(
     """Band rows and their derivatives along `directions`."""
     along = directions(instrument, plan)
 
-    def rows(values: Vector) -> light.Rows:
+    def rows(values: ParameterVector) -> light.Rows:
         return light.band_rows(with_values(instrument)(values), plan, x, y)
 
     return along, *derivatives(rows, (values,), (jnp.asarray(along.seeds(values.size)),))
