@@ -33,6 +33,7 @@ from command import run_program  # noqa: E402
 from study_options import options_of  # noqa: E402
 
 PLAN = """\
+filters = ["SDSS-r"]
 grid = 9
 standard_grid = 3
 polariser_angles = 8
@@ -51,13 +52,14 @@ def prepare(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
     Path("plan.toml").write_text(PLAN)
-    Path("plan_g.toml").write_text('filters = ["SDSS-g"]\n' + PLAN)
+    Path("other.toml").write_text(PLAN.replace("SDSS-r", "NB-580"))
+    Path("both.toml").write_text(PLAN.replace('"SDSS-r"', '"SDSS-r", "NB-580"'))
     stars = ("--stars", 400, "--seed", 9)
     steps: dict[str, Sequence[object]] = {
-        "n1.fits": ("simulate", "plan.toml", "--seed", 11, "-o", "n1.fits", "--truth", "T1.json"),
+        "n1.fits": ("simulate", "both.toml", "--seed", 11, "-o", "n1.fits", "--truth", "T1.json"),
         RUN: ("refit", "n1.fits", "-o", RUN),
         "base.fits": ("simulate", "plan.toml", "--like", "T1.json", *stars, "-o", "base.fits"),
-        "other.fits": ("simulate", "plan_g.toml", "--like", "T1.json", *stars, "-o", "other.fits"),
+        "other.fits": ("simulate", "other.toml", "--like", "T1.json", *stars, "-o", "other.fits"),
     }
     for made, command in steps.items():
         if not Path(made).exists():
@@ -111,7 +113,6 @@ def of_cameras(
     for name, k in zip(names, order, strict=True):
         columns = Table({"ALPHA_J2000": table["RA"], "DELTA_J2000": table["DEC"]})
         columns["FLUX_AUTO"], columns["FLUXERR_AUTO"] = table["N"][:, k], table["N_ERR"][:, k]
-        columns["FLUX_AUTO"].unit = columns["FLUXERR_AUTO"].unit = "electron"
         columns["BP_RP"] = table["BP_RP"]
         changed = change(columns, k)
         columns = columns if changed is None else changed
@@ -386,7 +387,7 @@ FURTHER = (
     Mistake("N_ERR without read noise and sky, half as large", one(errors(lambda n, s: 0.5 * s)), "N_ERR is .*(too small|smaller)"),
     Mistake("N_ERR per second of 30 s", one(errors(lambda n, s: s / 30)), "N_ERR is .*(too small|smaller)"),
     Mistake("TEFF in 1000 K", one(kilokelvin), "TEFF"),
-    Mistake("FILTER of the exposure before: seen in SDSS-g", another_filter, "seen in SDSS-g"),
+    Mistake("FILTER of the exposure before: seen in NB-580", another_filter, "seen in NB-580"),
     Mistake("ID begins anew: two stars of one ID", one(numbers_begin_anew), "ID"),
     Mistake("−999 where a star was not seen", one(not_seen), "-999|−999|E2", mended=True),
     Mistake("right ascension and declination exchanged", cameras(change=exchanged_on_sky), "exchange|DEC|declination"),
@@ -403,7 +404,7 @@ def answers(mistake: Mistake) -> dict[str, Any]:
         Path(old).unlink(missing_ok=True)
     commands = mistake.made()
     for command in commands:
-        done = run_program(*command, "--quiet")
+        done = run_program(*command)
         if done.exit_code not in (0, 3):
             break
     lines = done.stdout.strip().splitlines() if done.exit_code in (0, 3) else []
@@ -412,7 +413,7 @@ def answers(mistake: Mistake) -> dict[str, Any]:
     whole = done.output
     if done.exit_code in (0, 3):
         table = commands[-1][2]
-        again = run_program("check", RUN, table, "--quiet")
+        again = run_program("check", RUN, table)
         text = again.stdout.strip() or again.stderr.strip()
         said |= {"check": again.exit_code, "check_first": text.splitlines()[0] if text else ""}
     named = re.search(mistake.named, whole if mistake.mended else first) is not None
