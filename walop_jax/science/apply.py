@@ -107,9 +107,8 @@ def apply(
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
     chosen, few = work.sample(STAR_SAMPLE), work.sample(OWN_SAMPLE)
     readings = work.readings(chosen)
-    mended = readings is not None and bool(
-        readings.better
-    )  # what the stars say of the instrument means nothing then
+    # What the stars say of the instrument means nothing where they are not what the catalogue says.
+    mended = readings is not None and readings.mended
     blocks, watched, own = [], [], []
     for done, rows in work.blocks():
         block = work.block(rows)
@@ -122,7 +121,7 @@ def apply(
     check = dataclasses.replace(work.checked(watched, chosen), readings=readings, own=work.balanced(own))
     if check.doubtful:
         readings = work.readings(chosen, doubted=True)
-        if readings is not None and readings.better:
+        if readings is not None and readings.mended:
             check = dataclasses.replace(NOTHING_TO_SPARE, readings=readings)
     return with_sky(work.together(_joined(blocks), check), catalogue)
 

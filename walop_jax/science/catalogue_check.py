@@ -109,7 +109,7 @@ class CatalogueCheck:
     @property
     def misread(self) -> bool:
         """True if another reading of the catalogue mends it."""
-        return self.readings is not None and bool(self.readings.better)
+        return self.readings is not None and self.readings.mended
 
     @property
     def doubtful(self) -> bool:
@@ -157,7 +157,7 @@ class CatalogueCheck:
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
-        if self.readings is not None and self.readings.better:
+        if self.readings is not None and self.readings.mended:
             return (self.readings.words(),)
         texts = [place.words() for place in self.places]
         if self.own is not None and self.own.found:

@@ -23,6 +23,8 @@ Counts = Float[np.ndarray, "n k"]
 
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
 QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
+_RELATIVE = 0.3  # error of bright stars above which N_ERR is no share of N
+_NOISIER = 10.0  # of the variance of photons: sky and detectors add to it
 _TURNED = 1.0  # deg, by which ROTATOR may differ from what positions say: convergence of meridians
 _SCALE = 0.02  # by which the scale of X and Y may
 _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
@@ -32,6 +34,18 @@ _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
 def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
     """Sentences where errors are none of electrons, so that neither they nor the counts are what they should be."""
     lit = np.isfinite(counts) & (counts > 0)
+    bright = lit & (sigma > 0) & (np.maximum(counts, sigma) > BRIGHT)
+    if bright.any():
+        n, error = counts[bright], sigma[bright]
+        if _like_photons(sigma=n, counts=error):
+            yield "N_ERR is the square of N, as counts are of their errors: were N and N_ERR exchanged? Exchange them"
+            return
+        if _like_photons(sigma=n * error, counts=n) and np.median(error) < _RELATIVE:
+            yield (
+                "N_ERR is relative to N, or in magnitudes: N · N_ERR, not N_ERR, is the noise of photons; multiply it by "
+                "N (and by 0.921 if it is in magnitudes)"
+            )
+            return
     if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
         what = f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons"
         number = f"both would be those of photons if they were multiplied by {1.0 / share:.3g}"
@@ -43,6 +57,11 @@ def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
     if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
         number = f"the root of N_ERR is {float(np.median(np.sqrt(sigma[bright] / counts[bright]))):.2g} times that of N"
         yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted; {number}"
+
+
+def _like_photons(sigma: OfRows, counts: OfRows) -> bool:
+    """True if errors are those of counts in electrons, with a noise of sky and detectors as it is usual."""
+    return 0.8 < float(np.median(sigma**2 / counts)) < _NOISIER
 
 
 def field_against_sky(source: InputTable, x: OfRows, y: OfRows, rotator: OfRows) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """Mistakes in a catalogue, tried where its stars contradict the calibration: other readings of the same rows.
 
-Cameras in another order, a rotator of the wrong sign, a field that is mirrored, turned or shifted, magnitudes for
-intensities, another filter, other gains: each makes residuals that no change of an instrument makes, and each is
-undone by rewriting the rows. A reading is judged by a few hundred bright stars, with
+Cameras in another order, a rotator of the wrong sign, a field that is mirrored, turned, shifted or stretched, radians,
+magnitudes for intensities, another filter, other gains: each makes residuals that no change of an instrument makes, and
+each is undone by rewriting the rows. A reading is judged by a few hundred bright stars, with
 
     Σ min(χ², `CAP` ν) + 4 n ln s        χ² of a star with `FLOOR` of its light added to the errors,
                                          s the robust scatter of q and u of the n stars that measure them,
@@ -10,6 +10,9 @@ undone by rewriting the rows. A reading is judged by a few hundred bright stars,
 the second because two cameras of one arm can be exchanged without a trace in χ²: the cross-talk, wrongly taken out,
 then stays in q and u. Readings are tried where more than a tenth of the stars disagree; exchanges within arms always.
 What makes the sum smaller by `BETTER` and lets the stars agree is reported, with all that do so as well.
+
+Rows in which one camera holds another star than the others are no reading: its light differs from theirs by factors that
+no polarisation of stars makes (`APART`), either way. Where they are many they are told ahead of all readings.
 
 Limits      One mistake at a time. A ROTATOR that is wrong beside right X and Y turns q and u of all stars alike: only
             rows of one star at several rotators, or RA and DEC, show it.
@@ -50,7 +53,13 @@ _STEP = 5.0  # deg, of turns of the field that are tried
 _SHIFTS = 8  # to either side, in the range that is tried: …
 _FINE = 0.005  # deg, about what a part of the stars says
 _RANGE = 0.75  # … this share of the field
-_SEARCHED = 100  # stars that turns and shifts are searched with
+_SEARCHED = 100  # stars that turns, shifts and scales are searched with
+_SCALES = np.geomspace(0.3, 3.0, 60)
+"""Factors on positions that are tried: a step moves stars at the edge as much as one of `_STEP` does."""
+APART = 1.5
+"""Factor by which a camera must differ from the others to hold another star; these differ by its root at most."""
+_AGREEING = 3  # cameras that must agree on a star
+_BRIGHT = 0.05  # relative error of a camera up to which a row is asked for other stars
 _CONVERGENCE = 3.0  # deg, of the meridians over a field
 
 OfRows = Float[np.ndarray, " r"]
@@ -123,16 +132,47 @@ class CatalogueReading:
         }
 
 
+class OtherStars(NamedTuple):
+    """The `camera` that holds other stars than the others in `rows` of the `bright` rows of a sample."""
+
+    camera: str
+    rows: int
+    bright: int
+
+    @property
+    def many(self) -> bool:
+        """True if they are too many for blends."""
+        return self.rows > DISAGREE * self.bright
+
+    def words(self) -> str:
+        """The finding in a sentence."""
+        return (
+            f"N of {self.camera} are those of other stars in {self.rows} of {self.bright} bright rows: they differ "
+            f"from all other cameras by a factor of {APART:g} or more, either way (match its stars with theirs anew)"
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class CatalogueReadings:
-    """How a catalogue of so many `stars` (a sample) agrees as it stands, and the readings that mend it, best first."""
+    """How a catalogue of so many `stars` (a sample) agrees as it stands, and the readings that mend it, best first.
+
+    `others` is the camera that holds other stars in most rows (None: none does in any).
+    """
 
     stars: int
     stands: Fit
     better: tuple[CatalogueReading, ...] = ()
+    others: OtherStars | None = None
+
+    @property
+    def mended(self) -> bool:
+        """True if the catalogue is not what it says, and what it should be is known."""
+        return bool(self.better) or (self.others is not None and self.others.many)
 
     def words(self) -> str:
         """What is wrong, in a sentence."""
+        if self.others is not None and self.others.many:
+            return self.others.words()
         reasons = "; or if ".join(f"{reading.what} ({reading.remedy})" for reading in self.better)
         number, best = round(self.stands.disagree * self.stars), self.better[0].fit
         then = f"{round(best.disagree * self.stars)} of {self.stars}"
@@ -149,6 +189,7 @@ class CatalogueReadings:
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         about = {"stars": self.stars, "disagree": self.stands.disagree, "scatter": self.stands.scatter}
+        about |= {"other_stars": None if self.others is None else self.others._asdict()}
         return {**about, "readings": [reading.document() for reading in self.better]}
 
 
@@ -166,11 +207,14 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     if not np.isfinite(stands.loss):
         return None
     cameras = vectors.instrument.cameras
+    others = _other_stars(judge, rows)
+    if others is not None and others.many:
+        return CatalogueReadings(count, stands, (), others)
     arms = [arm for arm in cameras.arms if len(arm) > 1]
     tries: list[Iterable[CatalogueReading]] = [[*orders(cameras.names, arms), *_units(rows)]]
     if doubted or stands.disagree > DISAGREE:
-        named = [*orders(cameras.names), *_units(rows), *_fields(), *_rotators(rows)]
-        tries = [named, _turns(judge, rows), _shifts(judge, rows), _filters(vectors, rows)]
+        named = [*orders(cameras.names), *_units(rows), *_fields(), *_rotators(rows), *_radians(judge, rows)]
+        tries = [named, _turns(judge, rows), _scales(judge, rows), _shifts(judge, rows), _filters(vectors, rows)]
         tries += [_gains(judge, rows), _all_gains(judge, rows)]
     gains = [judge.judged(item, rows) for item in _gains(judge, rows)] if len(tries) > 1 else []
     usual = min((item.fit.loss for item in gains if item.usual), default=np.inf)
@@ -181,8 +225,8 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
             break
         if good:
             alike = tuple(item for item in good if item.fit.loss < good[0].fit.loss + ALIKE)
-            return CatalogueReadings(count, stands, alike)
-    return CatalogueReadings(count, stands)
+            return CatalogueReadings(count, stands, alike, others)
+    return CatalogueReadings(count, stands, (), others)
 
 
 def _mends(fit: Fit, stands: Fit) -> bool:
@@ -395,6 +439,57 @@ def _turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     )
 
 
+def _radians(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+    """X and Y in radians, where the field would hold them."""
+    largest = max(float(np.abs(rows.x).max()), float(np.abs(rows.y).max()))
+    if 0 < np.rad2deg(largest) <= 1.5 * judge.vectors.half_width:
+        yield CatalogueReading(
+            "X and Y were in radians", "give degrees", _placed(lambda x, y: (np.rad2deg(x), np.rad2deg(y)))
+        )
+
+
+def _scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+    """The field stretched, as a whole or along right ascension, by factors that are searched."""
+    few = _some_of(rows)
+
+    def best(turn: Callable[[float], Turn]) -> tuple[float, Turn]:
+        def loss(logarithm: float) -> float:
+            return min(judge.fit(_placed(turn(float(np.exp(logarithm))))(few)).misfit, 1e30)
+
+        tried = np.log(_SCALES)
+        start, step = float(tried[int(np.argmin([loss(float(one)) for one in tried]))]), tried[1] - tried[0]
+        found: Any = optimize.minimize_scalar(loss, bounds=(start - step, start + step), method="bounded")
+        factor = float(np.exp(found.x))
+        return factor, turn(factor)
+
+    factor, turn = best(lambda factor: lambda x, y: (factor * x, factor * y))
+    yield CatalogueReading(
+        f"X and Y were {factor:.4g} times as large", "correct the scale of the pixels", _placed(turn)
+    )
+    known = rows.rotator[np.isfinite(rows.rotator)]
+    if not known.size:
+        return
+    angle = float(np.angle(np.mean(np.exp(1j * np.deg2rad(known)))))
+    s, c = np.sin(angle), np.cos(angle)
+
+    def stretched(factor: float) -> Turn:
+        """X and Y where the distance to the east is another one."""
+
+        def of(x: OfRows, y: OfRows) -> tuple[OfRows, OfRows]:
+            more = (factor - 1.0) * (x * s + y * c)
+            return x + more * s, y + more * c
+
+        return of
+
+    factor, turn = best(stretched)
+    dec = f" (DEC of ±{np.rad2deg(np.arccos(factor)):.1f}°)" if factor < 1.0 else ""
+    yield CatalogueReading(
+        f"distances along right ascension were {factor:.4g} times as large",
+        f"is the difference of right ascension multiplied by the cosine of DEC, once{dec}?",
+        _placed(turn),
+    )
+
+
 def _shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     """The field shifted, by what is searched."""
     few, reach = _some_of(rows), _RANGE * judge.vectors.half_width
@@ -429,6 +524,29 @@ def _shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         "correct RA and DEC of the pointing, or the zero of X and Y",
         moved(best),
     )
+
+
+def _other_stars(judge: Judge, rows: Rows) -> OtherStars | None:
+    """The camera whose light in some rows is not that of the star that all others see; None where none is so."""
+    names = judge.vectors.instrument.cameras.names
+    inside = judge.within(rows)
+    if not len(inside.x) or len(names) < _AGREEING + 1:
+        return None
+    counts, expected = judge.unpolarised(inside)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        light = np.log(counts / expected)
+        bright = (inside.sigma < _BRIGHT * counts).all(axis=1) & np.isfinite(light).all(axis=1)
+    light, limit = light[bright], float(np.log(APART))
+    if len(light) < FEWEST:
+        return None
+    light = light - np.median(light, axis=0)  # gains are no other stars
+    number = []
+    for k in range(len(names)):
+        others = np.delete(light, k, axis=1)
+        agree = np.ptp(others, axis=1) < 0.5 * limit
+        number.append(int(np.sum(agree & (np.abs(light[:, k] - others.mean(axis=1)) > limit))))
+    worst = int(np.argmax(number))
+    return OtherStars(names[worst], number[worst], len(light)) if number[worst] else None
 
 
 def _some_of(rows: Rows) -> Rows:
