@@ -230,7 +230,7 @@ def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
 
 def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatch):
     """The plate that has changed may do so by a thousandth of the width of its prior only."""
-    monkeypatch.setattr("walop_jax.science.watch_readings.FARTHEST", 1e-3)
+    monkeypatch.setattr("walop_jax.science.star_columns.FARTHEST", 1e-3)
     watch = study.watched(400, 7, turned=("half2.plate.mgf2", 3.0))
     assert not watch.holds
     assert any(change.best.kind == "unnamed" and change.camera is None for change in watch.changes)
@@ -251,7 +251,7 @@ def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
     plain[..., number] = 1e-3 * like_q
     watching = Watching(dataclasses.replace(stars, plain=plain), vectors)
     size, error, _ = watching.answers(*watching.scan(stars.residual, ones))
-    column = [reading.name for reading in watching.readings.listed].index(vectors.named[number][0])
+    column = [reading.name for reading in watching.questions].index(vectors.named[number][0])
     assert np.isinf(error[:, column]).all()
     assert not size[:, column].any()
     assert (error > 0).all()

@@ -243,14 +243,24 @@ TABLE = (
         cameras(primary=POINTING | {"FILTER": "SDSS-i"}, header={}),
         "FILTER.*SDSS-i|SDSS-i.*calibration",
     ),
-    Mistake("another instrument, cameras", cameras(header=POINTING | {"INSTRUME": "WALOP-NORTH"}), "WALOP-NORTH"),
+    Mistake(
+        "another instrument, cameras", cameras(header=POINTING | {"INSTRUME": "WALOP-NORTH"}), "WALOP-NORTH"
+    ),
     Mistake("another instrument, one table", one(in_header(INSTRUME="WALOP-NORTH")), "WALOP-NORTH"),
     Mistake("MJD of one camera a day off", cameras(MJD={1: 61346.2}), "MJD"),
-    Mistake("O2 and E1 exchanged, by their names", cameras(names=("O1", "O2", "E1", "E2")), "O2.*in the place of.*E1"),
+    Mistake(
+        "O2 and E1 exchanged, by their names",
+        cameras(names=("O1", "O2", "E1", "E2")),
+        "O2.*in the place of.*E1",
+    ),
     Mistake("O2 and E1 exchanged, other names", cameras(order=(0, 2, 1, 3)), "order O1, O2, E1, E2"),
     Mistake("O1 and E1 exchanged", one(ordered((1, 0, 2, 3))), "order E1, O1, O2, E2"),
     Mistake("arms exchanged", one(ordered((2, 3, 0, 1))), "order O2, E2, O1, E1"),
-    Mistake("ROTATOR of the wrong sign", cameras(header=POINTING | {"ROTATOR": -35.0}), "ROTATOR had the wrong sign"),
+    Mistake(
+        "ROTATOR of the wrong sign",
+        cameras(header=POINTING | {"ROTATOR": -35.0}),
+        "ROTATOR had the wrong sign",
+    ),
     Mistake("RA of the pointing 0.1° off", cameras(header=POINTING | {"RA": 97.6}), "field centre lies 0.07"),
     Mistake("X and Y exchanged", one(placed(lambda x, y: (y, x))), "X and Y were exchanged"),
     Mistake("X mirrored", one(placed(lambda x, y: (-x, y))), "X ran the other way"),
@@ -362,7 +372,9 @@ def beside(t: Table) -> None:
     t.remove_columns(["RA", "DEC"])
 
 
-ROTATED = Mistake("ROTATOR of the pointing before", one(rotated(lambda r: r + 47.5)), "turned by −47.[0-9]*°|47.[0-9]* *°")
+ROTATED = Mistake(
+    "ROTATOR of the pointing before", one(rotated(lambda r: r + 47.5)), "turned by −47.[0-9]*°|47.[0-9]* *°"
+)
 FURTHER = (
     Mistake("E2 by a smaller aperture, 5 % fainter", one(scaled(3, 0.95)), r"E2 (fainter by [45]|were 1\.05)"),
     Mistake("E1 exposed for 20 s, all others for 30 s", one(scaled(1, 2 / 3)), r"E1 were 1\.[45]"),
@@ -375,7 +387,7 @@ FURTHER = (
     Mistake("E2 not linear: −3 % at 10⁶ electrons", one(bent), "E2 fainter by [23].* 10⁶"),
     Mistake("bright stars saturated, all at one number", one(clipped), "393210|393 210|3.93e|saturat|ceiling|full well"),
     ROTATED,
-    Mistake("ROTATOR of +Y in place of +X", one(rotated(lambda r: r + 90.0)), "ROTATOR were .*90°.*35° in place of 125°"),
+    Mistake("ROTATOR of +Y in place of +X", one(rotated(lambda r: r + 90.0)), "ROTATOR were .*90°.*3[45][.0-9]*° in place of 125°"),
     Mistake("the pointing of date, stars of J2000", centre_of_date, "field centre lies 0.1[34]"),
     Mistake("X and Y from the corner of the frame", one(placed(lambda x, y: (x + 0.25, y + 0.25))), "lay at X|field centre|corner"),
     Mistake("X and Y without the cosine of DEC", one(without_cosine), "cos|stretch|right ascension"),
@@ -391,7 +403,7 @@ FURTHER = (
     Mistake("−999 where a star was not seen", one(not_seen), "-999|−999|E2", mended=True),
     Mistake("right ascension and declination exchanged", cameras(change=exchanged_on_sky), "exchange|DEC|declination"),
     Mistake("DEC of the pointing without its sign", cameras(header=POINTING | {"DEC": 44.0}), "DEC|pointing|field centre|degrees? (away|from)"),
-    Mistake("the file of O1 given twice, also as E1", same_file, "O1.*E1.*(same|equal|cop|repeat)|(same|equal|cop|repeat).*O1.*E1"),
+    Mistake("the file of O1 given twice, also as E1", same_file, "O1.*E1.*(same|equal|cop|repeat)|has the fluxes of a.fits: it is the same"),
     Mistake("N and N_ERR exchanged", one(exchanged_errors), "N_ERR.*exchange|exchange.*N_ERR|N_ERR.*in the place"),
     Mistake("ROTATOR of +Y beside right X and Y, no RA, DEC", one(beside), "ROTATOR", hidden=True),
 )  # fmt: skip
@@ -417,7 +429,11 @@ def answers(mistake: Mistake) -> dict[str, Any]:
         said |= {"check": again.exit_code, "check_first": text.splitlines()[0] if text else ""}
     named = re.search(mistake.named, whole if mistake.mended else first) is not None
     stops = said["apply"] != 0 or mistake.mended
-    return said | {"named": named, "stops": stops, "of_check": re.search(mistake.named, said["check_first"]) is not None}
+    return said | {
+        "named": named,
+        "stops": stops,
+        "of_check": re.search(mistake.named, said["check_first"]) is not None,
+    }
 
 
 def study(mistakes: Sequence[Mistake]) -> Iterator[dict[str, Any]]:
@@ -441,8 +457,12 @@ def main() -> None:
         told[part] = []
         for said in study([m for m in mistakes if given.only in m.what]):
             told[part].append(said)
-            marks = f"{'named' if said['named'] else 'NOT NAMED'}, exit {said['apply']}, check {said['check']}"
-            print(f"{said['what']}: {marks}\n    {said['first']}\n    check: {said['check_first']}", flush=True)
+            marks = (
+                f"{'named' if said['named'] else 'NOT NAMED'}, exit {said['apply']}, check {said['check']}"
+            )
+            print(
+                f"{said['what']}: {marks}\n    {said['first']}\n    check: {said['check_first']}", flush=True
+            )
     for part, said in told.items():
         if said:
             named, stops = sum(one["named"] for one in said), sum(one["stops"] for one in said)

@@ -1,7 +1,7 @@
 """A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
 
 Rows are taken star by star in blocks that fit into memory. The result of a star does not depend on the rest of
-the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
+the catalogue, until all of it is looked at together (`star_search`): then errors grow for all stars by what
 that has found.
 """
 
@@ -25,16 +25,16 @@ from walop_jax.io.errors import DataError, rows_text
 from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of, sample_of
 from walop_jax.science.catalogue_readings import Rows as ReadRows
 from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
-from walop_jax.science.instrument_changes import PossibleChange
-from walop_jax.science.left_over_sky import with_sky
-from walop_jax.science.own_light import OwnLight, OwnLightCheck, own_light_check, unpolarised
+from walop_jax.science.star_columns import PossibleChange
+from walop_jax.science.star_light import OwnLight, own_light_check, unpolarised, with_sky
 from walop_jax.science.star_residuals import StarResiduals, by_place
+from walop_jax.science.star_search import CatalogueSearch
+from walop_jax.science.star_words import NOTHING_TO_SPARE, CatalogueCheck
 from walop_jax.sky.position_angles import sky_to_instrument
 
 OfRows = Float[np.ndarray, "r k"]  # by row and camera
@@ -118,7 +118,8 @@ def apply(
             own += work.own_light(block, few)
         if progress is not None:
             progress(done, len(catalogue))
-    check = dataclasses.replace(work.checked(watched, chosen), readings=readings, own=work.balanced(own))
+    check = dataclasses.replace(work.checked(watched, chosen), readings=readings)
+    check = work.with_own_light(check, own)
     if check.doubtful:
         readings = work.readings(chosen, doubted=True)
         if readings is not None and readings.mended:
@@ -146,6 +147,14 @@ def residuals_of(
     for _, rows_there in work.blocks():
         every += work.residuals(work.block(rows_there), chosen)
     return every
+
+
+def readings_in(
+    vectors: AnalysisVectors, catalogue: Catalogue, *, force: bool = False, doubted: bool = False
+) -> CatalogueReadings | None:
+    """Other readings of a catalogue, of which one may mend it (`catalogue_readings.readings_of`)."""
+    work = _Application(vectors, catalogue, force=force)
+    return work.readings(work.sample(STAR_SAMPLE), doubted=doubted)
 
 
 class _Block(NamedTuple):
@@ -399,13 +408,34 @@ class _Application:
         _, group = np.unique(np.nan_to_num(np.round(catalogue.time, 3)), return_inverse=True)
         place = catalogue.points.x[row], catalogue.points.y[row], group.reshape(-1)[row]
         x, y, exposure = (values[good] for values in place)
-        return [OwnLight(light.qu[good], light.noise[good], x, y, exposure, light.shifts[good], nuisances)]
+        of_stars = (values[good] for values in (light.qu, light.noise))
+        return [OwnLight(*of_stars, x, y, exposure, light.shifts[good], nuisances, light.cameras[good])]
 
-    def balanced(self, parts: list[OwnLight]) -> OwnLightCheck | None:
-        """What q and u of the stars say of the balance of the arms; `None` of few stars."""
-        names = self.vectors.instrument.cameras.names
+    def with_own_light(self, check: CatalogueCheck, parts: list[OwnLight]) -> CatalogueCheck:
+        """The check with what q and u of the stars say of the balance of the arms; nothing of few stars.
+
+        A change of a camera moves q and u as well as the sums of the cameras. What is found in both is told once: of
+        changes that describe the sums alike, those are kept behind which q and u follow the instrument no more.
+        """
+        if not parts:
+            return check
+        names, light = self.vectors.instrument.cameras.names, OwnLight.joined(parts)
         named = [(names[first], names[second]) for first, second in self.arms]
-        return own_light_check(OwnLight.joined(parts), named) if parts else None
+        own, changes = own_light_check(light, named), [*check.changes]
+        for n, change in enumerate(check.changes if own is not None and own.found else ()):
+            kept = []
+            for entry in (entry for entry in change.alike if entry.relative):
+                of_one = np.full(len(light.x), entry.size)
+                share = check.growth.electrons(entry, light.x, light.y, np.full(len(light.x), np.nan), of_one)
+                shift = sum(light.cameras[:, :, names.index(name)] for name in entry.members)
+                beside = own_light_check(light.without(share[:, None] * shift), named)
+                if beside is not None and not beside.found:
+                    kept.append((entry, beside))
+            if kept:
+                alike = tuple(entry for entry, _ in kept)
+                changes[n], own = dataclasses.replace(change, best=alike[0], alike=alike), kept[0][1]
+                break
+        return dataclasses.replace(check, changes=tuple(changes), own=own)
 
     def checked(self, watched: list[StarResiduals], chosen: Chosen) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
@@ -416,11 +446,8 @@ class _Application:
         """
         if not watched:
             return NOTHING_TO_SPARE
-        vectors, names = self.vectors, self.vectors.instrument.cameras.names
-        widths = [self.vectors.calibration.model[name].width for name, _ in vectors.named]
-        search = CatalogueSearch(
-            StarResiduals.joined(watched), names, vectors.named, vectors.root, widths=widths
-        )
+        vectors = self.vectors
+        search = CatalogueSearch(StarResiduals.joined(watched), vectors)
         check = search.answer()
         for _ in range(_EXPANSIONS):
             errors = None if check.holds else search.errors_of_calibration()
@@ -435,7 +462,7 @@ class _Application:
             same = joined is not None and joined.residual.shape == search.stars.residual.shape
             if joined is None or (same and search.bend(errors, joined.residual) < _STRAIGHT):
                 break
-            search = CatalogueSearch(joined, names, vectors.named, vectors.root, errors, widths)
+            search = CatalogueSearch(joined, vectors, errors)
             check = search.answer()
         return check
 
@@ -461,8 +488,9 @@ class _Application:
         def shift(entry: PossibleChange) -> Pairs:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
-            grown, k = np.zeros_like(counts), cameras.index(entry.name)
-            grown[:, k] = check.growth.electrons(entry, *place, counts[:, k])
+            grown = np.zeros_like(counts)
+            for k in map(cameras.index, entry.members):
+                grown[:, k] = check.growth.electrons(entry, *place, counts[:, k])
             return calibration_shift(fitted.gain, fitted.relative(grown)[..., None], block.star)[..., 0]
 
         total, first = np.zeros_like(block.stars.changed), np.flatnonzero(np.diff(block.star, prepend=-1))

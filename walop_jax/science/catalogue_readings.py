@@ -11,8 +11,8 @@ the second because two cameras of one arm can be exchanged without a trace in χ
 then stays in q and u. Readings are tried where more than a tenth of the stars disagree; exchanges within arms always.
 What makes the sum smaller by `BETTER` and lets the stars agree is reported, with all that do so as well.
 
-Rows in which one camera holds another star than the others are no reading: its light differs from theirs by factors that
-no polarisation of stars makes (`APART`), either way. Where they are many they are told ahead of all readings.
+Rows in which one camera holds another star than the others are no reading: its light differs from theirs by factors
+that no polarisation of stars makes (`APART`), either way. Where they are many they are told ahead of all readings.
 
 Limits      One mistake at a time. A ROTATOR that is wrong beside right X and Y turns q and u of all stars alike: only
             rows of one star at several rotators, or RA and DEC, show it.
@@ -35,7 +35,7 @@ from walop_jax.instruments.description import shipped
 from walop_jax.io.text import with_minus_sign
 from walop_jax.model.cameras import other_orders
 from walop_jax.science.estimate import estimate
-from walop_jax.science.instrument_changes import LARGEST
+from walop_jax.science.star_columns import LARGEST
 from walop_jax.sky.position_angles import sky_to_instrument
 
 STARS = 300  # that are looked at
@@ -211,10 +211,24 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     if others is not None and others.many:
         return CatalogueReadings(count, stands, (), others)
     arms = [arm for arm in cameras.arms if len(arm) > 1]
-    tries: list[Iterable[CatalogueReading]] = [[*orders(cameras.names, arms), *_units(rows)]]
+    always = [*orders(cameras.names, arms), *_units(rows), *_filters(vectors, rows)]
+    tries: list[Iterable[CatalogueReading]] = [always]
     if doubted or stands.disagree > DISAGREE:
-        named = [*orders(cameras.names), *_units(rows), *_fields(), *_rotators(rows), *_radians(judge, rows)]
-        tries = [named, _turns(judge, rows), _scales(judge, rows), _shifts(judge, rows), _filters(vectors, rows)]
+        named = [
+            *orders(cameras.names),
+            *_units(rows),
+            *_filters(vectors, rows),
+            *_fields(),
+            *_rotators(rows),
+            *_radians(judge, rows),
+        ]
+        tries = [
+            named,
+            _turns(judge, rows),
+            _scales(judge, rows),
+            _shifts(judge, rows),
+            _filters(vectors, rows),
+        ]
         tries += [_gains(judge, rows), _all_gains(judge, rows)]
     gains = [judge.judged(item, rows) for item in _gains(judge, rows)] if len(tries) > 1 else []
     usual = min((item.fit.loss for item in gains if item.usual), default=np.inf)

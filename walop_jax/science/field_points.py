@@ -17,6 +17,7 @@ from walop_jax.io.errors import rows_text
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 
+ANOTHER_PLACE = 0.005  # deg: positions that lie farther apart are two places of the field
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
 _WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
 _FINITE = finite("correct or remove these rows")
