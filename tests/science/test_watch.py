@@ -7,6 +7,8 @@ import re
 
 import numpy as np
 import pytest
+from star_tables import read
+from star_tables import stars as star_table
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
@@ -14,7 +16,7 @@ from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
-from walop_jax.science.watch import Watching, dated, grouped, with_rivals
+from walop_jax.science.watch import Watching, dated, grouped, watch, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +129,26 @@ def test_scale_of_noise_is_that_of_the_many():
     scale = noise_scale(chi2, dof)
     assert scale.value == pytest.approx(2.25, abs=5 * 2.25 * np.sqrt(2 / scale.worth))
     assert 0.7 * dof.sum() < scale.worth < dof.sum()
+
+
+def test_a_catalogue_that_is_not_what_it_says_is_told_in_place_of_changes(calibration, tmp_path):
+    """Two nights, in the second of which two cameras of an arm are exchanged: its name, its order, and no change."""
+    nights = []
+    for night in range(2):
+        table = star_table(study.vectors(), 200, np.random.default_rng(night), teff=5500.0)[0]
+        table["MJD"] = 60000.0 + night
+        nights.append(table)
+    sound = [read(table, tmp_path) for table in nights]
+    assert watch(calibration, sound).holds
+    for name in ("N", "N_ERR"):
+        nights[1][name] = nights[1][name][:, [1, 0, 2, 3]]
+    found = watch(calibration, [sound[0], read(nights[1], tmp_path)], names=["a.fits", "b.fits"])
+    assert not found.holds
+    (doubt,) = found.against
+    assert doubt.blocking
+    assert doubt.sentence.startswith("b.fits: ")
+    assert "in the order E1, O1, O2, E2" in doubt.sentence
+    assert found.document()["misread"] == [doubt.sentence]
 
 
 def test_exposure_groups_are_joined_where_there_are_many():

@@ -269,7 +269,7 @@ TABLE = (
     Mistake("fluxes per second", one(scaled([0, 1, 2, 3], 1 / 60.0)), "rate|per second|gain"),
     Mistake("NaN in a position", one(no_place), "left out|no place|X", mended=True),
     Mistake("rows that are there twice", one(twice), "copies of another row", mended=True),
-    Mistake("CSV with ; and decimal commas", semicolons, "decimal comma", mended=True),
+    Mistake("CSV with ; and decimal commas", semicolons, "decimals? (by )?comma", mended=True),
     Mistake("errors three times too large", one(errors(lambda n, s: 3.0 * s)), "N_ERR is .*too large"),
 )
 

@@ -206,14 +206,14 @@ def _another_centre(catalogue: CameraCatalogue, pointing: Pointing) -> str:
     """What may be wrong with a centre that is far from all stars: the mistake that would put it among them."""
     ra, dec = pointing.ra, pointing.dec
     mistakes = {
-        "is RA in hours? In degrees it is 15 times as much": (15.0 * ra, dec),
+        "is RA in hours?": (15.0 * ra, dec),
         "has DEC lost its sign?": (ra, -dec),
         "is RA in hours, and has DEC lost its sign?": (15.0 * ra, -dec),
     }
     for words, (there, up) in mistakes.items():
         away = directions.separation(there % 360.0, up, catalogue.ra, catalogue.dec)
         if float(np.median(away)) <= FARTHEST:
-            return f"{words} It would lie among the stars; give it in degrees (--ra, --dec)"
+            return f"{words} Its stars would lie there; give degrees (--ra, --dec)"
     return "is it of another field? Is the centre in degrees (--ra, --dec)?"
 
 

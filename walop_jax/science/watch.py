@@ -61,6 +61,7 @@ from walop_jax.science.star_search import Seen, StarSearch, Strongest, fitted, s
 from walop_jax.science.star_words import FoundChange, Watch
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
+MISREAD_ROWS = 2048  # of catalogues of which it means nothing
 MOST_GROUPS = 150  # exposure groups that are separated; neighbours of more are joined
 EDGES = (2.0, 8.0)  # sharpness of spots: a blurred one and one with an edge
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
@@ -95,6 +96,7 @@ def watch(
             yield from (f"{name}: {text}" if told else text for text in (*mended, *catalogue.doubts))
 
     wrong = tuple(misread())
+    rows = min(rows, MISREAD_ROWS) if wrong else rows
     catalogues, remarks = dated(catalogues, names)
     total, batches = sum(map(len, catalogues)), []
     for catalogue in catalogues:
