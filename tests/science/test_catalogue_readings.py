@@ -9,7 +9,8 @@ import pytest
 from star_tables import stars
 
 from walop_jax.data.settings import Settings
-from walop_jax.science.catalogue_readings import CatalogueReadings, Rows, readings_of, turned
+from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of
+from walop_jax.science.other_readings import Rows, turned
 
 ROTATOR = 35.0
 

@@ -38,6 +38,7 @@ from walop_jax.calibration.analysis_vectors import AnalysisVectors  # noqa: E402
 from walop_jax.calibration.calibration import Calibration  # noqa: E402
 from walop_jax.data.settings import Settings  # noqa: E402
 from walop_jax.data.user_tables import in_memory  # noqa: E402
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.fit.refit import refit  # noqa: E402
 from walop_jax.model.instrument import Instrument  # noqa: E402
 from walop_jax.science import apply as application  # noqa: E402
@@ -101,9 +102,10 @@ def designs() -> dict[str, Design]:
 @functools.cache
 def vectors(name: str) -> AnalysisVectors:
     """Those of the calibration of a design."""
-    return AnalysisVectors(
-        Calibration.from_fit(refit(simulate(designs()[name].plan, seed=SEED).calset).judged())
-    )
+    plan = designs()[name].plan
+    calset = simulate(plan, seed=SEED).calset
+    own = plan.instrument if isinstance(plan.instrument, Instrument) else None
+    return AnalysisVectors(Calibration.from_fit(refit(calset, base_model(calset, own)).judged()))
 
 
 def true_vectors(v: AnalysisVectors, setting: Settings, x: Any, y: Any, change: Any) -> np.ndarray:

@@ -26,14 +26,14 @@ from walop_jax.likelihood.flux import Sharing, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of, sample_of
-from walop_jax.science.catalogue_readings import Rows as ReadRows
 from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
+from walop_jax.science.other_readings import Rows as ReadRows
 from walop_jax.science.star_columns import PossibleChange
-from walop_jax.science.star_light import OwnLight, own_light_check, unpolarised, with_sky
+from walop_jax.science.star_light import OwnLight, unpolarised, with_sky
 from walop_jax.science.star_residuals import StarResiduals, by_place
-from walop_jax.science.star_search import CatalogueSearch
+from walop_jax.science.star_search import CatalogueSearch, with_own_light
 from walop_jax.science.star_words import NOTHING_TO_SPARE, CatalogueCheck
 from walop_jax.sky.position_angles import sky_to_instrument
 
@@ -119,7 +119,7 @@ def apply(
         if progress is not None:
             progress(done, len(catalogue))
     check = dataclasses.replace(work.checked(watched, chosen), readings=readings)
-    check = work.with_own_light(check, own)
+    check = work.balanced(check, own)
     if check.doubtful:
         readings = work.readings(chosen, doubted=True)
         if readings is not None and readings.mended:
@@ -411,31 +411,10 @@ class _Application:
         of_stars = (values[good] for values in (light.qu, light.noise))
         return [OwnLight(*of_stars, x, y, exposure, light.shifts[good], nuisances, light.cameras[good])]
 
-    def with_own_light(self, check: CatalogueCheck, parts: list[OwnLight]) -> CatalogueCheck:
-        """The check with what q and u of the stars say of the balance of the arms; nothing of few stars.
-
-        A change of a camera moves q and u as well as the sums of the cameras. What is found in both is told once: of
-        changes that describe the sums alike, those are kept behind which q and u follow the instrument no more.
-        """
-        if not parts:
-            return check
-        names, light = self.vectors.instrument.cameras.names, OwnLight.joined(parts)
-        named = [(names[first], names[second]) for first, second in self.arms]
-        own, changes = own_light_check(light, named), [*check.changes]
-        for n, change in enumerate(check.changes if own is not None and own.found else ()):
-            kept = []
-            for entry in (entry for entry in change.alike if entry.relative):
-                of_one = np.full(len(light.x), entry.size)
-                share = check.growth.electrons(entry, light.x, light.y, np.full(len(light.x), np.nan), of_one)
-                shift = sum(light.cameras[:, :, names.index(name)] for name in entry.members)
-                beside = own_light_check(light.without(share[:, None] * shift), named)
-                if beside is not None and not beside.found:
-                    kept.append((entry, beside))
-            if kept:
-                alike = tuple(entry for entry, _ in kept)
-                changes[n], own = dataclasses.replace(change, best=alike[0], alike=alike), kept[0][1]
-                break
-        return dataclasses.replace(check, changes=tuple(changes), own=own)
+    def balanced(self, check: CatalogueCheck, parts: list[OwnLight]) -> CatalogueCheck:
+        """The check with what q and u of the stars say of the balance of the arms; nothing of few stars."""
+        names = self.vectors.instrument.cameras.names
+        return with_own_light(check, OwnLight.joined(parts), names, self.arms) if parts else check
 
     def checked(self, watched: list[StarResiduals], chosen: Chosen) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.

@@ -16,8 +16,8 @@ from walop_jax.data import plausible, user_tables
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
 from walop_jax.io.text import with_minus_sign
-from walop_jax.science.catalogue_readings import MIRRORED
 from walop_jax.science.field_points import ANOTHER_PLACE
+from walop_jax.science.other_readings import MIRRORED
 from walop_jax.sky.directions import Pointing
 
 OfRows = Float[np.ndarray, " n"]

@@ -60,6 +60,7 @@ from walop_jax.science.star_columns import (
     profile,
     rivals_of,
 )
+from walop_jax.science.star_light import OwnLight, own_light_check
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights, own_variance
 from walop_jax.science.star_words import CatalogueCheck, DisagreeingPlace, FoundChange
 
@@ -320,6 +321,33 @@ class CatalogueSearch(StarSearch):
         # A gain is the simplest of what describes the stars alike.
         ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
         return FoundChange(ranked[0], tuple(ranked))
+
+
+def with_own_light(
+    check: CatalogueCheck, light: OwnLight, cameras: Sequence[str], arms: Sequence[tuple[int, int]]
+) -> CatalogueCheck:
+    """A check with what q and u of the stars say of the balance of the arms.
+
+    A change of a camera moves q and u as well as the sums of the cameras. What is found in both is told once: of
+    changes that describe the sums alike, those are kept behind which q and u follow the instrument no more.
+    """
+    named = [(cameras[first], cameras[second]) for first, second in arms]
+    own, changes = own_light_check(light, named), [*check.changes]
+    undated = np.full(len(light.x), np.nan)
+    for n, change in enumerate(check.changes if own is not None and own.found else ()):
+        kept = []
+        for entry in (entry for entry in change.alike if entry.relative):
+            size = np.full(len(light.x), entry.size)
+            share = check.growth.electrons(entry, light.x, light.y, undated, size)
+            shift = sum(light.cameras[:, :, cameras.index(name)] for name in entry.members)
+            beside = own_light_check(light.without(share[:, None] * shift), named)
+            if beside is not None and not beside.found:
+                kept.append((entry, beside))
+        if kept:
+            alike = tuple(entry for entry, _ in kept)
+            changes[n], own = dataclasses.replace(change, best=alike[0], alike=alike), kept[0][1]
+            break
+    return dataclasses.replace(check, changes=tuple(changes), own=own)
 
 
 class _Look(NamedTuple):
