@@ -450,6 +450,7 @@ def all_gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
             f"N of {', '.join(names)} were {listed} times as large",
             f"are they of the calibrated instrument, and not of {others} or another one; are all cameras in one unit?",
             _scaled(factors),
+            usual=bool(np.all(np.abs(factors - 1.0) <= LARGEST)),
         )
 
 
