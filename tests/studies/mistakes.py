@@ -8,7 +8,8 @@ the folder). Each mistake is made in these files, as an observer makes it, and t
 that refuses; the exit codes of apply and check; and whether the sentence names the cause, by a pattern that was written
 down with the mistake. `TABLE` are those of a review of the program, `FURTHER` were written from what observers do, ahead
 of any word for them in the program. What is `mended` is no mistake any more once it was read, and said; what is
-`hidden` leaves no trace in any number of the catalogue.
+`hidden` leaves no trace in any number of the catalogue: ROTATOR beside right X and Y, and a FILTER by which χ² of 300
+stars changes from 148.7 to 148.2 and the scatter of their q and u from 2.44 to 2.46 %.
 """
 
 from __future__ import annotations
@@ -398,7 +399,7 @@ FURTHER = (
     Mistake("N_ERR without read noise and sky, half as large", one(errors(lambda n, s: 0.5 * s)), "N_ERR is .*(too small|smaller)"),
     Mistake("N_ERR per second of 30 s", one(errors(lambda n, s: s / 30)), "N_ERR is .*(too small|smaller)"),
     Mistake("TEFF in 1000 K", one(kilokelvin), "TEFF"),
-    Mistake("FILTER of the exposure before: seen in NB-580", another_filter, "seen in NB-580"),
+    Mistake("FILTER of the exposure before: seen in NB-580", another_filter, "seen in NB-580", hidden=True),
     Mistake("ID begins anew: two stars of one ID", one(numbers_begin_anew), "ID"),
     Mistake("−999 where a star was not seen", one(not_seen), "-999|−999|E2", mended=True),
     Mistake("right ascension and declination exchanged", cameras(change=exchanged_on_sky), "exchange|DEC|declination"),
@@ -421,6 +422,7 @@ def answers(mistake: Mistake) -> dict[str, Any]:
     lines = done.stdout.strip().splitlines() if done.exit_code in (0, 3) else []
     first = lines[0] if lines else done.stderr.strip().splitlines()[-1]
     said = {"what": mistake.what, "first": first, "apply": done.exit_code, "check": None, "check_first": ""}
+    said["hidden"] = mistake.hidden
     whole = done.output
     if done.exit_code in (0, 3):
         table = commands[-1][2]
@@ -464,9 +466,10 @@ def main() -> None:
                 f"{said['what']}: {marks}\n    {said['first']}\n    check: {said['check_first']}", flush=True
             )
     for part, said in told.items():
-        if said:
-            named, stops = sum(one["named"] for one in said), sum(one["stops"] for one in said)
-            print(f"{part}: {named} of {len(said)} named first, {len(said) - stops} with exit code 0")
+        shown = [one for one in said if not one["hidden"]]
+        named, stops = sum(one["named"] for one in shown), sum(one["stops"] for one in shown)
+        hidden = f"; {len(said) - len(shown)} hidden" if len(said) > len(shown) else ""
+        print(f"{part}: {named} of {len(shown)} named first, {len(shown) - stops} with exit code 0{hidden}")
     if written is not None:
         written.write_text(json.dumps(told, indent=1, ensure_ascii=False))
 

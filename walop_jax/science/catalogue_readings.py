@@ -3,14 +3,15 @@
 Cameras in another order, a rotator of the wrong sign, a field that is mirrored, turned, shifted or stretched, radians,
 magnitudes for intensities, another filter, other gains: each makes residuals that no change of an instrument makes, and
 each is undone by rewriting the rows (`other_readings`). Readings are tried where more than a tenth of the stars
-disagree; exchanges within arms and other filters always. What makes the loss smaller by `BETTER` and lets the stars
+disagree; exchanges within arms always. What makes the loss smaller by `BETTER` and lets the stars
 agree is reported, with all that do so as well.
 
 Rows in which one camera holds another star than the others are no reading: its light differs from theirs by factors
 that no polarisation of stars makes (`APART`), either way. Where they are many they are told ahead of all readings.
 
 Limits      One mistake at a time. A ROTATOR that is wrong beside right X and Y turns q and u of all stars alike: only
-            rows of one star at several rotators, or RA and DEC, show it.
+            rows of one star at several rotators, or RA and DEC, show it. A wrong FILTER shows where the cross-talk or
+            the shares of the cameras differ between the two by more than the noise of the stars.
 """
 
 from __future__ import annotations
@@ -114,13 +115,12 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     if others is not None and others.many:
         return CatalogueReadings(count, stands, (), others)
     arms = [arm for arm in cameras.arms if len(arm) > 1]
-    always = [*tried_as.orders(cameras.names, arms), *tried_as.units(rows), *tried_as.filters(vectors, rows)]
+    always = [*tried_as.orders(cameras.names, arms), *tried_as.units(rows)]
     tries: list[Iterable[CatalogueReading]] = [always]
     if doubted or stands.disagree > DISAGREE:
         named = [
             *tried_as.orders(cameras.names),
             *tried_as.units(rows),
-            *tried_as.filters(vectors, rows),
             *tried_as.fields(),
             *tried_as.rotators(rows),
             *tried_as.radians(judge, rows),
@@ -137,7 +137,7 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     usual = min((item.fit.loss for item in gains if item.usual), default=np.inf)
     for tried in tries:
         judged = [judge.judged(item, rows) for item in tried if not item.usual]
-        good = sorted((item for item in judged if _mends(item.fit, stands)), key=lambda item: item.fit.loss)
+        good = sorted((item for item in judged if _mends(item, stands)), key=lambda item: item.fit.loss)
         if good and usual < good[0].fit.loss + ALIKE:
             break
         if good:
@@ -146,11 +146,13 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     return CatalogueReadings(count, stands, (), others)
 
 
-def _mends(fit: Fit, stands: Fit) -> bool:
-    """True if the stars agree, as they do not as the catalogue stands."""
+def _mends(reading: CatalogueReading, stands: Fit) -> bool:
+    """True if the stars agree with a reading, as they do not as the catalogue stands."""
+    fit = reading.fit
     agrees = fit.disagree <= max(stands.disagree / 3.0, 0.5 * DISAGREE)
     excess, before = fit.misfit - fit.dof, max(stands.misfit - stands.dof, 0.0)
-    return fit.loss < stands.loss - BETTER and agrees and excess <= before / 4.0
+    sums = not reading.searched or fit.misfit < stands.misfit - BETTER
+    return fit.loss < stands.loss - BETTER and agrees and sums and excess <= before / 4.0
 
 
 def sample_of(rows: Rows) -> Rows:

@@ -43,6 +43,7 @@ _RANGE = 0.75  # … this share of the field
 _SEARCHED = 100  # stars that turns, shifts and scales are searched with
 _SCALES = np.geomspace(0.3, 3.0, 60)
 """Factors on positions that are tried: a step moves stars at the edge as much as one of `_STEP` does."""
+_SAME = 0.02  # by which a scale may be another: optics change by less, and calibrations know theirs to less
 _CONVERGENCE = 3.0  # deg, of the meridians over a field
 
 OfRows = Float[np.ndarray, " r"]
@@ -96,7 +97,8 @@ NO_FIT = Fit(np.inf, 1.0, np.inf)
 class CatalogueReading:
     """Another reading of a catalogue: what must have happened, what to do about it, how well the stars agree then.
 
-    `usual` are changes as instruments have them: no mistake of the catalogue.
+    `usual` are changes as instruments have them: no mistake of the catalogue. A number that was `searched` for among
+    all of its values must make χ² smaller, not only the scatter of q and u.
     """
 
     what: str
@@ -104,6 +106,7 @@ class CatalogueReading:
     change: Callable[[Rows], Rows]
     fit: Fit = NO_FIT
     usual: bool = False
+    searched: bool = False
 
     def document(self) -> dict[str, Any]:
         """The reading as plain data."""
@@ -300,6 +303,7 @@ def turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         f"X and Y were turned by {number}°, as a ROTATOR that is {number}° larger turns them",
         "correct the rotator of the pointing",
         _placed(lambda x, y: turned(x, y, angle)),
+        searched=True,
     )
 
 
@@ -328,7 +332,11 @@ def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
 
     factor, turn = best(lambda factor: lambda x, y: (factor * x, factor * y))
     yield CatalogueReading(
-        f"X and Y were {factor:.4g} times as large", "correct the scale of the pixels", _placed(turn)
+        f"X and Y were {factor:.4g} times as large",
+        "correct the scale of the pixels",
+        _placed(turn),
+        usual=abs(np.log(factor)) < _SAME,
+        searched=True,
     )
     known = rows.rotator[np.isfinite(rows.rotator)]
     if not known.size:
@@ -351,6 +359,8 @@ def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         f"distances along right ascension were {factor:.4g} times as large",
         f"is the difference of right ascension multiplied by the cosine of DEC, once{dec}?",
         _placed(turn),
+        usual=abs(np.log(factor)) < _SAME,
+        searched=True,
     )
 
 
@@ -387,6 +397,7 @@ def shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         f"all stars lay at X {x}° and Y {y}° from where they are said to be{where}",
         "correct RA and DEC of the pointing, or the zero of X and Y",
         moved(best),
+        searched=True,
     )
 
 

@@ -343,8 +343,8 @@ def with_own_light(
             beside = own_light_check(light.without(share[:, None] * shift), named)
             if beside is not None and not beside.found:
                 kept.append((entry, beside))
-        if kept:
-            alike = tuple(entry for entry, _ in kept)
+        if kept:  # light that is added, or grows, is not asked
+            alike = (*(entry for entry, _ in kept), *(entry for entry in change.alike if not entry.relative))
             changes[n], own = dataclasses.replace(change, best=alike[0], alike=alike), kept[0][1]
             break
     return dataclasses.replace(check, changes=tuple(changes), own=own)
