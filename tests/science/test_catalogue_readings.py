@@ -102,6 +102,7 @@ def test_a_pointing_that_is_off(vectors, sound):
         (lambda east, north: (1.15 * east, 1.15 * north), "if X and Y were ", 1 / 1.15),
         (lambda east, north: (east / 0.7, north), "if distances along right ascension were ", 0.7),
     ],
+    ids=["scale", "cosine"],
 )
 def test_a_field_that_is_stretched(vectors, sound, change, words, factor):
     """By the scale of the pixels, or where the cosine of a declination of 45.6° was left out."""

@@ -335,7 +335,7 @@ def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         f"X and Y were {factor:.4g} times as large",
         "correct the scale of the pixels",
         _placed(turn),
-        usual=abs(np.log(factor)) < _SAME,
+        usual=bool(abs(np.log(factor)) < _SAME),
         searched=True,
     )
     known = rows.rotator[np.isfinite(rows.rotator)]
@@ -359,7 +359,7 @@ def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         f"distances along right ascension were {factor:.4g} times as large",
         f"is the difference of right ascension multiplied by the cosine of DEC, once{dec}?",
         _placed(turn),
-        usual=abs(np.log(factor)) < _SAME,
+        usual=bool(abs(np.log(factor)) < _SAME),
         searched=True,
     )
 
