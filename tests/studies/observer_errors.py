@@ -1,13 +1,13 @@
 """Fifty mistakes of an observer in a catalogue of stars: what does the program say first, and does it stop?
 
-    python tests/studies/mistakes.py [--folder mistakes] [--only WORD] [--json FILE]
+    python tests/studies/observer_errors.py [--folder FOLDER] [--only WORD] [--json FILE]
 
 A calibration is fitted to a simulated set, and 400 stars are simulated that the same instrument sees (both are kept in
 the folder). Each mistake is made in these files, as an observer makes it, and the files go through `walop-jax gather`
 (where they are those of the cameras), `apply` and `check`. Printed are the first sentence of apply, or of the command
 that refuses; the exit codes of apply and check; and whether the sentence names the cause, by a pattern that was written
-down with the mistake. `TABLE` are those of a review of the program, `FURTHER` were written from what observers do, ahead
-of any word for them in the program. What is `mended` is no mistake any more once it was read, and said; what is
+down with the mistake. `TABLE` are those of a review of the program, `FURTHER` were written from what observers do,
+ahead of any word for them in the program. What is `mended` is no mistake any more once it was read, and said; what is
 `hidden` leaves no trace in any number of the catalogue: ROTATOR beside right X and Y, and a FILTER by which χ² of 300
 stars changes from 148.7 to 148.2 and the scatter of their q and u from 2.44 to 2.46 %.
 """
@@ -377,37 +377,83 @@ ROTATED = Mistake(
     "ROTATOR of the pointing before", one(rotated(lambda r: r + 47.5)), "turned by −47.[0-9]*°|47.[0-9]* *°"
 )
 FURTHER = (
-    Mistake("E2 by a smaller aperture, 5 % fainter", one(scaled(3, 0.95)), r"E2 (fainter by [45]|were 1\.05)"),
+    Mistake(
+        "E2 by a smaller aperture, 5 % fainter", one(scaled(3, 0.95)), r"E2 (fainter by [45]|were 1\.05)"
+    ),
     Mistake("E1 exposed for 20 s, all others for 30 s", one(scaled(1, 2 / 3)), r"E1 were 1\.[45]"),
-    Mistake("O2 and E2 in data numbers of 1.6 electrons", one(scaled([2, 3], 1 / 1.6)), r"O2 and E2 were 1\.[56]"),
-    Mistake("E1 joined by the number of the row, one off", one(shifted_rows), "E1.*(other stars|another star|row)"),
+    Mistake(
+        "O2 and E2 in data numbers of 1.6 electrons", one(scaled([2, 3], 1 / 1.6)), r"O2 and E2 were 1\.[56]"
+    ),
+    Mistake(
+        "E1 joined by the number of the row, one off", one(shifted_rows), "E1.*(other stars|another star|row)"
+    ),
     Mistake("a third of O2 matched with neighbours", one(mismatched), "O2.*(other stars|another star|match)"),
-    Mistake("sky not subtracted in any camera", one(with_light([0, 1, 2, 3], 2e4)), "electrons too many in every row of (O1 and E1 and O2 and E2|all)|[Ss]ky (is|was) "),
+    Mistake(
+        "sky not subtracted in any camera",
+        one(with_light([0, 1, 2, 3], 2e4)),
+        "electrons too many in every row of (O1 and E1 and O2 and E2|all)|[Ss]ky (is|was) ",
+    ),
     Mistake("500 electrons of sky left in O2", one(with_light(2, 500.0)), "electrons too many in .*O2"),
-    Mistake("E1 without its flat field, 6 % along X", one(not_flat), "E1 (brighter|fainter) by [5-6].* edge .*X"),
+    Mistake(
+        "E1 without its flat field, 6 % along X", one(not_flat), "E1 (brighter|fainter) by [5-6].* edge .*X"
+    ),
     Mistake("E2 not linear: −3 % at 10⁶ electrons", one(bent), "E2 fainter by [23].* 10⁶"),
-    Mistake("bright stars saturated, all at one number", one(clipped), "393210|393 210|3.93e|saturat|ceiling|full well"),
+    Mistake(
+        "bright stars saturated, all at one number",
+        one(clipped),
+        "393210|393 210|3.93e|saturat|ceiling|full well",
+    ),
     ROTATED,
-    Mistake("ROTATOR of +Y in place of +X", one(rotated(lambda r: r + 90.0)), "ROTATOR were .*90°.*3[45][.0-9]*° in place of 125°"),
+    Mistake(
+        "ROTATOR of +Y in place of +X",
+        one(rotated(lambda r: r + 90.0)),
+        "ROTATOR were .*90°.*3[45][.0-9]*° in place of 125°",
+    ),
     Mistake("the pointing of date, stars of J2000", centre_of_date, "field centre lies 0.1[34]"),
-    Mistake("X and Y from the corner of the frame", one(placed(lambda x, y: (x + 0.25, y + 0.25))), "lay at X|field centre|corner"),
+    Mistake(
+        "X and Y from the corner of the frame",
+        one(placed(lambda x, y: (x + 0.25, y + 0.25))),
+        "lay at X|field centre|corner",
+    ),
     Mistake("X and Y without the cosine of DEC", one(without_cosine), "cos|stretch|right ascension"),
-    Mistake("scale of the pixels 10 % too large", one(placed(lambda x, y: (1.1 * x, 1.1 * y))), "(larger|smaller|scale).*1.1|0.9|10 %"),
+    Mistake(
+        "scale of the pixels 10 % too large",
+        one(placed(lambda x, y: (1.1 * x, 1.1 * y))),
+        "(larger|smaller|scale).*1.1|0.9|10 %",
+    ),
     Mistake("X and Y in radians", one(placed(lambda x, y: (np.deg2rad(x), np.deg2rad(y)))), "radian"),
     Mistake("MJD is the Julian Date", one(julian), "JD|Julian"),
     Mistake("N_ERR relative to N", one(errors(lambda n, s: s / n)), "N_ERR.*(relative|fraction|magnitude)"),
-    Mistake("N_ERR without read noise and sky, half as large", one(errors(lambda n, s: 0.5 * s)), "N_ERR is .*(too small|smaller)"),
+    Mistake(
+        "N_ERR without read noise and sky, half as large",
+        one(errors(lambda n, s: 0.5 * s)),
+        "N_ERR is .*(too small|smaller)",
+    ),
     Mistake("N_ERR per second of 30 s", one(errors(lambda n, s: s / 30)), "N_ERR is .*(too small|smaller)"),
     Mistake("TEFF in 1000 K", one(kilokelvin), "TEFF"),
     Mistake("FILTER of the exposure before: seen in NB-580", another_filter, "seen in NB-580", hidden=True),
     Mistake("ID begins anew: two stars of one ID", one(numbers_begin_anew), "ID"),
     Mistake("−999 where a star was not seen", one(not_seen), "-999|−999|E2", mended=True),
-    Mistake("right ascension and declination exchanged", cameras(change=exchanged_on_sky), "exchange|DEC|declination"),
-    Mistake("DEC of the pointing without its sign", cameras(header=POINTING | {"DEC": 44.0}), "DEC|pointing|field centre|degrees? (away|from)"),
-    Mistake("the file of O1 given twice, also as E1", same_file, "O1.*E1.*(same|equal|cop|repeat)|has the fluxes of a.fits: it is the same"),
-    Mistake("N and N_ERR exchanged", one(exchanged_errors), "N_ERR.*exchange|exchange.*N_ERR|N_ERR.*in the place"),
+    Mistake(
+        "right ascension and declination exchanged",
+        cameras(change=exchanged_on_sky),
+        "exchange|DEC|declination",
+    ),
+    Mistake(
+        "DEC of the pointing without its sign",
+        cameras(header=POINTING | {"DEC": 44.0}),
+        "DEC|pointing|field centre|degrees? (away|from)",
+    ),
+    Mistake(
+        "the file of O1 given twice, also as E1",
+        same_file,
+        "O1.*E1.*(same|equal|cop|repeat)|has the fluxes of a.fits: it is the same",
+    ),
+    Mistake(
+        "N and N_ERR exchanged", one(exchanged_errors), "N_ERR.*exchange|exchange.*N_ERR|N_ERR.*in the place"
+    ),
     Mistake("ROTATOR of +Y beside right X and Y, no RA, DEC", one(beside), "ROTATOR", hidden=True),
-)  # fmt: skip
+)
 
 
 def answers(mistake: Mistake) -> dict[str, Any]:
