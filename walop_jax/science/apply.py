@@ -408,8 +408,9 @@ class _Application:
         _, group = np.unique(np.nan_to_num(np.round(catalogue.time, 3)), return_inverse=True)
         place = catalogue.points.x[row], catalogue.points.y[row], group.reshape(-1)[row]
         x, y, exposure = (values[good] for values in place)
-        of_stars = (values[good] for values in (light.qu, light.noise))
-        return [OwnLight(*of_stars, x, y, exposure, light.shifts[good], nuisances, light.cameras[good])]
+        seen = (light.qu, light.noise, light.shifts, light.cameras)
+        qu, noise, shifts, cameras = (values[good] for values in seen)
+        return [OwnLight(qu, noise, x, y, exposure, shifts, nuisances, cameras)]
 
     def balanced(self, check: CatalogueCheck, parts: list[OwnLight]) -> CatalogueCheck:
         """The check with what q and u of the stars say of the balance of the arms; nothing of few stars."""
