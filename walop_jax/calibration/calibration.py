@@ -23,7 +23,6 @@ from walop_jax.calibration.matrix import (
     matrix_draws,
     matrix_names,
     of_structure,
-    planned_matrices,
     slopes_over_field,
 )
 from walop_jax.data.grid import Grid
@@ -52,7 +51,6 @@ from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.elements.registry import defined_elements
 from walop_jax.model.instrument import Instrument, adapted, build, nominal_instrument
 from walop_jax.model.parameters import Parameter
-from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, Vector
 
 if TYPE_CHECKING:
@@ -65,8 +63,8 @@ Covariances = Float[np.ndarray, "p m m"]
 Columns = dict[str, tuple[np.ndarray, str]]  # values, description
 
 MAP_SIZE = 31  # pixels along each axis of the maps: 0.02° over ±0.3°
-MAP_NODES = (18, 24, 30)  # per side, for the standard errors in the maps
-MAP_ERRORS = 1e-6  # of those, relative
+MAP_NODES = (18, 24, 30)  # per side, of the tables that the maps are made of
+MAP_ERRORS = 1e-6  # of the standard errors, relative: the elements themselves are then right to 10⁻⁹
 HIGH_CROSSTALK = 10.0  # condition number of the local 2 × 2 inverse
 UNCHECKED = (
     "made by an earlier version, whose content hash does not cover all words of the headers: fit again"
@@ -424,10 +422,7 @@ class Calibration(Fitted):
         if self.draws is not None:
             values, covariance = self._elements(x, y, settings)
         else:
-            instrument = self.model.instrument(self.values)
-            plan = plan_for_settings(instrument, settings[:1], self.curves(settings[:1]))
-            values = planned_matrices(instrument, plan, x, y)
-            _, covariance, _ = self.over_field(x, y, settings[:1], MAP_NODES, MAP_ERRORS)
+            values, covariance, _ = self.over_field(x, y, settings[:1], MAP_NODES, MAP_ERRORS)
         errors = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0.0, None))
         planes, flat = (-1, size, size), values.reshape(size * size, -1)
         return MatrixMaps(grid, name, flat.T.reshape(planes), errors.T.reshape(planes), settings[:1].inside())

@@ -23,7 +23,7 @@ PARTS = 16
 
 JACOBIAN_BLOCK = 64
 """Field points whose Jacobians are worked on together: these stay in the processor's cache."""
-RESPONSES_TOGETHER = 32
+RESPONSES_TOGETHER = 16
 """Field points whose responses are computed together: one program serves sets of any size."""
 RESPONSES_AT_ONCE = 4
 """Those of them that are worked on at a time: their derivatives stay in the processor's cache, and take two fifths of

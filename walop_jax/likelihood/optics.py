@@ -28,6 +28,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import light
+from walop_jax.model.compiled import derivatives
 from walop_jax.model.dependence import optical_reach
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Scalar, Vector, values_of, with_values
@@ -80,8 +81,11 @@ def _slopes(
 ) -> tuple[Directions, light.Rows, Float[Array, "c b r 4"]]:
     """Band rows and their derivatives along `directions`."""
     along = directions(instrument, plan)
-    rows, push = jax.linearize(lambda v: light.band_rows(with_values(instrument)(v), plan, x, y), values)
-    return along, rows, jax.vmap(push)(jnp.asarray(along.seeds(values.size)))
+
+    def rows(values: Vector) -> light.Rows:
+        return light.band_rows(with_values(instrument)(values), plan, x, y)
+
+    return along, *derivatives(rows, (values,), (jnp.asarray(along.seeds(values.size)),))
 
 
 @jax.custom_jvp
@@ -165,13 +169,13 @@ def linearised(
 ) -> LocalDerivatives:
     """A quantity of all parameters and the local throughputs, and its derivatives at those of an instrument."""
     values, plain = values_of(instrument), plain_positions(instrument)
-    value, push = jax.linearize(quantity, values, local)
-    unit_steps = jnp.eye(local.size).reshape(-1, *local.shape)
-    return LocalDerivatives(
-        value,
-        jax.vmap(lambda change: push(change, jnp.zeros_like(local)))(jnp.eye(values.size)[plain]),
-        jax.vmap(lambda change: push(jnp.zeros_like(values), change))(unit_steps),
-    )
+    # One after the other, in one derivative.
+    count, unit_steps = len(plain), np.eye(len(plain) + local.size)
+    steps = np.zeros((len(unit_steps), values.size))
+    steps[:count, plain] = np.eye(count)
+    of_local = unit_steps[:, count:].reshape(-1, *local.shape)
+    value, slopes = derivatives(quantity, (values, local), (jnp.asarray(steps), jnp.asarray(of_local)))
+    return LocalDerivatives(value, slopes[:count], slopes[count:])
 
 
 def through_series(local: Float[Any, "... m k"], basis: Float[Any, "... m t"]) -> Float[Any, "... kt"]:

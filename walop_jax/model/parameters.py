@@ -145,6 +145,8 @@ def as_number(value: Any) -> Any:
     """A value as a float64 array; None stays. Explicit, as weak types would be compiled anew beside arrays."""
     if value is None or (isinstance(value, jax.Array) and value.dtype == float and not value.weak_type):
         return value
+    if isinstance(value, bool | int | float | np.ndarray | np.generic):
+        return array(value, float)  # a tenth of the time: lists of candidates hold thousands of numbers
     with float64():
         return jnp.asarray(value, float)
 

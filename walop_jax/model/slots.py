@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
+from walop_jax.model.compiled import derivatives
 from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
@@ -64,6 +65,8 @@ def trains(instrument: Instrument) -> dict[str, tuple[Element, ...]]:
 @by_shapes
 def acts(element: Element) -> bool:
     """True if an element has a Mueller matrix."""
+    if _is_plate(element):
+        return True  # as its waves say, which would be traced for nothing else
     try:
         return jax.eval_shape(lambda e: e.mueller(Ray.on_trial(())), element) is not None
     except NotPlannedError:  # a matrix that depends on conditions
@@ -168,14 +171,18 @@ def vector_slopes(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> V
     shifted = jax.jacfwd(mean)(jnp.zeros(()))
     means = jnp.zeros((len(rows), len(shifted))).at[-1].set(shifted)
     neutral = _neutral(instrument, plan, x, y)
-    value, push = jax.linearize(functools.partial(_vectors, instrument, (x, y)), banded.rows, *neutral)
-    zeros = [jnp.zeros_like(tangent) for tangent in (banded.rows, *neutral)]
-    slopes = (
-        jax.vmap(lambda tangent, mean: push(tangent, mean, *zeros[2:]))(rows, means),
-        jax.vmap(lambda tangent: push(*zeros[:2], tangent, zeros[3]))(jnp.diag(neutral[1])),
-        jax.vmap(lambda tangent: push(*zeros[:3], tangent))(jnp.eye(len(neutral[2]))),
-    )
-    return VectorSlopes(value, jnp.concatenate(slopes))
+    # Of all in one derivative: of rows and mean wavelengths, then of the throughput, then of the shares.
+    blocks = (rows, means), (jnp.diag(neutral[1]),), (jnp.eye(len(neutral[2])),)
+    counts = [len(block[0]) for block in blocks]
+    steps = [
+        jnp.zeros((sum(counts), *block.shape[1:])).at[first : first + count].set(block)
+        for first, count, blocks_at in zip(
+            itertools.accumulate(counts, initial=0), counts, blocks, strict=False
+        )
+        for block in blocks_at
+    ]
+    vectors = functools.partial(_vectors, instrument, (x, y))
+    return VectorSlopes(*derivatives(vectors, (banded.rows, *neutral), tuple(steps)))
 
 
 def fringe_slopes(
@@ -195,7 +202,9 @@ def fringe_slopes(
         return _vectors(instrument, (x, y), rows, *_neutral(instrument, plan, x, y))
 
     banded = _banded(plan, (x, y), moved, (1, 0), gaps)
-    return jax.vmap(jax.vmap(jax.linearize(vectors, banded.rows)[1]))(banded.plates[:, :, 0])
+    steps = banded.plates[:, :, 0]
+    slopes = derivatives(vectors, (banded.rows,), (steps.reshape(-1, *banded.rows.shape),))[1]
+    return slopes.reshape(*steps.shape[:2], *slopes.shape[1:])
 
 
 def _neutral(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> tuple[Array, Array, Array]:
@@ -243,8 +252,7 @@ def _summed(
 
     single, together = sizes
     nothing = jnp.zeros(single + together)
-    (matrices, weights), push = jax.linearize(solved, nothing)
-    slopes, weight_slopes = jax.vmap(push)(jnp.eye(len(nothing)))
+    (matrices, weights), (slopes, weight_slopes) = derivatives(solved, (nothing,), (jnp.eye(len(nothing)),))
     path = path_of(neutral := moved(nothing))
     folded = path.around(matrices, len(plan.wavelength))
     sides = [
@@ -340,13 +348,13 @@ def light_slopes(instrument: Instrument, sight: Sight) -> LightSlopes:
     def stokes(sizes: Float[Array, " l"]) -> Float[Array, "e 4"]:
         return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), sight)
 
-    value, push = jax.linearize(stokes, jnp.zeros(len(slots)))
+    value, slopes = derivatives(stokes, (jnp.zeros(len(slots)),), (jnp.eye(len(slots)),))
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
     for gain in instrument.cameras.exposures:
         factors = gain.factors(exposures, x, y)
         factor, share = factor * factors, share * factors + gain.share(exposures, x, y)
     response = (factor[..., None] * value[:, None]).at[..., 0].add(share)
-    return LightSlopes(value, jax.vmap(push)(jnp.eye(len(slots))), response, factor)
+    return LightSlopes(value, slopes, response, factor)
 
 
 def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instrument:

@@ -166,11 +166,29 @@ def _offline() -> Iterator[None]:
     with (
         iers.conf.set_temp("auto_download", False),
         iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-        iers.earth_orientation_table.set(iers.IERS_B.open()),
+        iers.earth_orientation_table.set(_earth_orientation()),
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("ignore")
         yield
+
+
+_ORIENTATION = {"MJD": "d", "PM_x": "arcsec", "PM_y": "arcsec", "UT1_UTC": "s"}
+"""Columns of astropy's table of Earth rotation that a direction needs, and their units: those behind the date."""
+
+
+@functools.cache
+def _earth_orientation() -> Any:
+    """The Earth-rotation table that is installed with astropy, its 24 000 lines read by numpy.
+
+    `IERS_B.open` reads all 21 columns word by word, which took as long as a tenth of a fit.
+    """
+    from astropy import units
+    from astropy.utils import iers
+
+    columns = np.loadtxt(iers.IERS_B_FILE, usecols=range(4, 4 + len(_ORIENTATION)), unpack=True)
+    named = zip(_ORIENTATION.items(), columns, strict=True)
+    return iers.IERS_B({name: values * units.Unit(unit) for (name, unit), values in named})
 
 
 def rayleigh_sky(

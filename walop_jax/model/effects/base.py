@@ -23,7 +23,14 @@ from walop_jax.model.conventions import CAMERAS, EXTINCTION, OF_WALOP, Units
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import NoSuchPlaceError
-from walop_jax.model.parameters import Component, Parameter, field_declarations, unknown_name
+from walop_jax.model.parameters import (
+    Component,
+    Parameter,
+    as_number,
+    by_shapes,
+    field_declarations,
+    unknown_name,
+)
 from walop_jax.model.parameters import Scalar as Scalar
 
 
@@ -155,7 +162,9 @@ class Effect(Component):
         numbers, choices = self.declarations(), self.choices()
         for name, value in values.items():
             if name in numbers:
-                values[name] = jnp.broadcast_to(jnp.asarray(value, float), np.shape(getattr(self, name)))
+                shape = np.shape(getattr(self, name))
+                number = as_number(value)
+                values[name] = number if np.shape(number) == shape else jnp.broadcast_to(number, shape)
             elif name not in choices:
                 raise unknown_name(f"parameter of {self.name}", name, [*numbers, *choices])
         if "camera" in values:
@@ -203,11 +212,17 @@ class Effect(Component):
 
     def lacks(self, instrument: Instrument) -> str:
         """The part that the instrument lacks for the effect, in words; empty where it fits."""
-        try:
-            jax.eval_shape(lambda: self.patch(dataclasses.replace(instrument, effects=())))
-        except NoSuchPlaceError as error:
-            return str(error)
-        return ""
+        return _lacking(self, dataclasses.replace(instrument, effects=()))
+
+
+@by_shapes
+def _lacking(effect: Effect, bare: Instrument) -> str:
+    """The part that an instrument without effects lacks for an effect."""
+    try:
+        jax.eval_shape(lambda effect, bare: effect.patch(bare), effect, bare)
+    except NoSuchPlaceError as error:
+        return str(error)
+    return ""
 
 
 def with_amplitudes(
