@@ -361,7 +361,7 @@ def test_exposures_that_are_not_there(changes, message):
 
 
 def test_exposures_that_say_nothing_of_what_is_wanted(small):
-    """The polariser is indoors: its light has nothing of the sky."""
+    """The polariser is behind the telescope: its light has nothing of the sky."""
     polariser_alone = dataclasses.replace(small, choices=small.choices[:1], families=small.families[:1])
     with pytest.raises(ValueError, match=r"sky.depolarisation: no possible exposure .* no moon or standard"):
         plan_from(polariser_alone, 15.0, criterion_by_name(polariser_alone, None, "sky.depolarisation"))

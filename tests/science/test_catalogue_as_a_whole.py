@@ -116,6 +116,24 @@ def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_pat
     assert "E1 brighter by 2.0" in change.words() or "E1 brighter by 1.9" in change.words()
 
 
+def test_a_camera_by_a_smaller_aperture_is_told_once(vectors, calibration, tmp_path):
+    """E2 fainter by 5 %: the sums of the arms and the q and u of the stars say it, each in its own way."""
+    table, _ = noisy(vectors, tmp_path, count=1500)
+    table["N"][:, 3] *= 0.95
+    check = apply(calibration, read(table, tmp_path)).check
+    (change,) = check.changes
+    gains = {entry.name: entry for entry in change.alike if entry.kind == "gain"}
+    assert gains["E2"].size == pytest.approx(-0.05, abs=0.004)  # first order
+    assert not check.unbalanced
+    (sentence,) = check.warnings()
+    assert "E2 fainter by 5" in sentence
+    # An exchange of light inside the arm leaves its sum: q and u alone say that.
+    table, _ = noisy(vectors, tmp_path, count=1500)
+    table["N"] = table["N"] * np.array([1.0, 1.0, 1.01, 0.99])
+    (found,) = [c for c in apply(calibration, read(table, tmp_path)).check.unbalanced if c.cameras[0] == "O2"]
+    assert found.size == pytest.approx(0.02, abs=4.0 * found.error)
+
+
 def test_rows_that_are_there_four_times_are_said(vectors, calibration, tmp_path):
     """Extracted four times from one exposure, they share its noise; copies to the last digit count once."""
     table, qu = noisy(vectors, tmp_path)

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from walop_jax.data.user_tables import in_memory
-from walop_jax.science.catalogue_doubts import errors_of_cameras, field_against_sky, units_of_counts
+from walop_jax.science.catalogue_doubts import (
+    ceilings,
+    errors_of_cameras,
+    field_against_sky,
+    many_are_full,
+    not_measured,
+    stars_of_one_name,
+    units_of_counts,
+)
 
 NAMES = ("O1", "E1", "O2", "E2")
 ROTATOR = 35.0
@@ -68,6 +76,40 @@ def test_counts_that_are_no_electrons():
     assert "if they were multiplied by 120, as rates" in sentence
     (sentence,) = units_of_counts(electrons, electrons + 900.0)
     assert "are these variances?" in sentence
+    (sentence,) = units_of_counts(np.sqrt(electrons), electrons)
+    assert "were N and N_ERR exchanged?" in sentence
+    for share in (1.0, 1.0857):  # of N, and in magnitudes
+        (sentence,) = units_of_counts(electrons, share * electrons**-0.5)
+        assert "N_ERR is relative to N, or in magnitudes" in sentence
+
+
+def test_stars_that_share_a_number_lie_at_two_places_at_one_time():
+    """Two of ten numbers; not where the telescope has moved between their rows, nor for one number of twenty."""
+    star, there = np.tile(np.arange(10), 2), np.where(np.arange(20) < 12, 0.0, 0.1)
+    star[10:12] = 8, 9
+    x, y, night = np.where(star > 7, there, 0.0), np.zeros(20), np.full(20, 60000.0)
+    (sentence,) = stars_of_one_name(star, x, y, night)
+    assert "ID: 2 of 10 stars are at several places of the field at one MJD" in sentence
+    assert list(stars_of_one_name(star, x, y, 60000.0 + np.arange(20))) == []
+    assert list(stars_of_one_name(star, x, y, np.full(20, np.nan))) == []
+    more = np.concatenate([np.where(star == 9, 0.0, x), np.zeros(10)])
+    stars = np.concatenate([star, 10 + np.arange(10)])
+    assert list(stars_of_one_name(stars, more, np.zeros(30), np.full(30, 60000.0))) == []
+
+
+def test_a_number_in_the_place_of_what_was_not_measured_and_a_ceiling_of_all_cameras():
+    counts = np.random.default_rng(2).uniform(2e4, 1e6, (60, 4))
+    sigma = np.sqrt(counts)
+    counts[3, 1] = sigma[3, 1] = -999.0
+    counts[4, 2] = -30.0  # noise about a subtracted sky
+    assert np.argwhere(not_measured(counts, sigma)).tolist() == [[3, 1]]
+    good = np.isfinite(counts).all(axis=1)
+    assert not many_are_full(counts)
+    assert list(ceilings(counts, good, NAMES)) == []
+    full = np.minimum(counts, 5e5)
+    assert many_are_full(full)
+    (found,) = ceilings(full, good, NAMES)
+    assert "is exactly 500000, the largest, of several cameras in rows " in found.what
 
 
 def test_errors_that_are_the_same_whatever_the_counts():

@@ -9,7 +9,8 @@ import pytest
 from star_tables import stars
 
 from walop_jax.data.settings import Settings
-from walop_jax.science.catalogue_readings import CatalogueReadings, Rows, readings_of, turned
+from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of
+from walop_jax.science.other_readings import Rows, turned
 
 ROTATOR = 35.0
 
@@ -93,6 +94,49 @@ def test_a_pointing_that_is_off(vectors, sound):
     numbers = text.partition("stars lay at X ")[2].replace("−", "-")
     found = float(numbers.partition("°")[0]), float(numbers.partition("Y ")[2].partition("°")[0])
     np.testing.assert_allclose(found, (dx, dy), atol=0.003)
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "factor"),
+    [
+        (lambda east, north: (1.15 * east, 1.15 * north), "if X and Y were ", 1 / 1.15),
+        (lambda east, north: (east / 0.7, north), "if distances along right ascension were ", 0.7),
+    ],
+    ids=["scale", "cosine"],
+)
+def test_a_field_that_is_stretched(vectors, sound, change, words, factor):
+    """By the scale of the pixels, or where the cosine of a declination of 45.6° was left out."""
+    s, c = np.sin(np.deg2rad(ROTATOR)), np.cos(np.deg2rad(ROTATOR))
+    inner = sound.of(np.maximum(np.abs(sound.x), np.abs(sound.y)) < 0.18)
+    east, north = change(inner.x * s + inner.y * c, inner.x * c - inner.y * s)
+    text = first(vectors, placed(inner, east * s + north * c, east * c - north * s), doubted=True)
+    found = float(text.partition(words)[2].partition(" times as large")[0])
+    assert found == pytest.approx(factor, rel=0.02)
+
+
+def test_a_field_in_radians(vectors, sound):
+    small = placed(sound, np.deg2rad(sound.x), np.deg2rad(sound.y))
+    assert "if X and Y were in radians (give degrees)" in first(vectors, small, doubted=True)
+
+
+def test_a_camera_that_holds_other_stars(vectors, sound):
+    """Every third star of O2 is the one four rows below: fluxes of the others are five times larger or smaller."""
+    flux = 10.0 ** np.random.default_rng(5).uniform(-0.7, 0.7, (150, 1))
+    many = sound.changed(counts=flux * sound.counts, sigma=np.sqrt(flux) * sound.sigma)
+    assert first(vectors, many, doubted=True) == ""
+    wrong, rows = many.counts.copy(), np.arange(0, 150, 3)
+    wrong[rows, 2] = many.counts[(rows + 4) % 150, 2]
+    found = readings_of(vectors, many.changed(counts=wrong))
+    assert isinstance(found, CatalogueReadings)
+    assert found.mended
+    assert found.others is not None
+    assert (found.others.camera, found.others.bright) == ("O2", 150)
+    off = np.abs(np.log(flux[rows, 0] / flux[(rows + 4) % 150, 0]))
+    assert np.sum(off > np.log(1.65)) <= found.others.rows <= np.sum(off > np.log(1.35))
+    assert "N of O2 are those of other stars in " in found.words()
+    # A camera with half of the light of all stars holds no other stars.
+    half = many.counts * np.array([1.0, 0.5, 1.0, 1.0])
+    assert "N of E1 were 2" in first(vectors, many.changed(counts=half))
 
 
 def test_magnitudes_and_a_camera_in_another_unit(vectors, sound):

@@ -47,6 +47,21 @@ def test_every_format_gives_the_same_stars(write, tmp_path):
     assert all(made[name].description for name in made.colnames)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"RA": CENTRE["RA"] / 15.0}, "is RA in hours?"),
+        ({"DEC": -CENTRE["DEC"]}, "has DEC lost its sign?"),
+        ({"RA": CENTRE["RA"] / 15.0, "DEC": -CENTRE["DEC"]}, "is RA in hours, and has DEC lost its sign?"),
+        ({"RA": 200.0}, "is it of another field?"),
+    ],
+)
+def test_a_centre_far_from_its_stars_is_told_what_would_put_it_among_them(wrong, words, tmp_path):
+    with pytest.raises(DataError, match=r"from the field centre") as caught:
+        walop.gather(four(STARS, tmp_path, words={**CENTRE, **wrong}))
+    assert words in str(caught.value)
+
+
 def test_a_shifted_and_rotated_camera_is_named_and_put_right(tmp_path, caplog):
     files = four(STARS, tmp_path)
     moved = STARS.copy()

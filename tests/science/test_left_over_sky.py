@@ -7,7 +7,7 @@ from star_tables import stars as table_of
 
 from walop_jax.fit.verdict import Quality
 from walop_jax.science.apply import apply
-from walop_jax.science.left_over_sky import CHANCE, left_over_sky
+from walop_jax.science.star_light import SKY_CHANCE, left_over_sky
 from walop_jax.science.stokes_columns import stokes_columns
 
 SKY, SCATTER = 1e4, 0.004
@@ -41,7 +41,7 @@ def test_found_at_the_bound():
     """One per cent of the sky's level, polarised by a tenth of it; then what is found in 99 of 100 catalogues."""
     rng = np.random.default_rng(2)
     error = left_over_sky(*stars(rng)).errors.mean()
-    limit = error * (np.sqrt(-2.0 * np.log(CHANCE)) + 2.33)
+    limit = error * (np.sqrt(-2.0 * np.log(SKY_CHANCE)) + 2.33)
     found = [left_over_sky(*stars(rng, share=(0.6 * limit, -0.8 * limit))) for _ in range(100)]
     assert sum(one.found for one in found) >= 96
     assert np.mean([one.share for one in found], axis=0) == pytest.approx(

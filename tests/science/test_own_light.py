@@ -9,7 +9,7 @@ import pytest
 from star_tables import setting
 
 from walop_jax.science.estimate import estimate
-from walop_jax.science.own_light import OwnLight, OwnLightCheck, own_light_check, unpolarised
+from walop_jax.science.star_light import OwnLight, OwnLightCheck, own_light_check, unpolarised
 
 ARMS = [("O1", "E1"), ("O2", "E2")]
 
@@ -40,7 +40,7 @@ def seen(field, rng, gains=(1.0, 1.0, 1.0, 1.0), electrons=2e5) -> OwnLight:
     counts = counts + sigma * rng.standard_normal(counts.shape)
     light = unpolarised(a, counts, sigma, np.arange(len(x)), [(0, 1), (2, 3)])
     group, nothing = np.zeros(len(x), int), np.zeros((len(x), 2, 0))
-    return OwnLight(light.qu, light.noise, x, y, group, light.shifts, nothing)
+    return OwnLight(light.qu, light.noise, x, y, group, light.shifts, nothing, light.cameras)
 
 
 def test_shifts_are_the_derivatives_of_q_and_u_and_qu_those_of_the_estimate(field):

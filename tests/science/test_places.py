@@ -8,8 +8,8 @@ from star_tables import read, stars
 
 from walop_jax.fit.verdict import Quality
 from walop_jax.science.apply import apply
-from walop_jax.science.places import places_of
 from walop_jax.science.star_residuals import StarResiduals
+from walop_jax.science.star_search import places_of
 
 CAMERAS = ("O1", "E1", "O2", "E2")
 

@@ -7,6 +7,8 @@ import re
 
 import numpy as np
 import pytest
+from star_tables import read
+from star_tables import stars as star_table
 from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
@@ -14,7 +16,7 @@ from walop_jax.data.user_tables import in_memory
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
-from walop_jax.science.watch import Watching, dated, grouped, with_rivals
+from walop_jax.science.watch import Watching, dated, grouped, watch, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +131,25 @@ def test_scale_of_noise_is_that_of_the_many():
     assert 0.7 * dof.sum() < scale.worth < dof.sum()
 
 
+def test_a_catalogue_that_is_not_what_it_says_is_told_in_place_of_changes(calibration, tmp_path):
+    """Two nights, in the second of which two cameras of an arm are exchanged: its name, its order, and no change."""
+    nights = []
+    for night in range(2):
+        table = star_table(study.vectors(), 200, np.random.default_rng(night), teff=5500.0)[0]
+        table["MJD"] = 60000.0 + night
+        nights.append(table)
+    sound = [read(table, tmp_path) for table in nights]
+    assert watch(calibration, sound).holds
+    for name in ("N", "N_ERR"):
+        nights[1][name] = nights[1][name][:, [1, 0, 2, 3]]
+    found = watch(calibration, [sound[0], read(nights[1], tmp_path)], names=["a.fits", "b.fits"])
+    assert not found.holds
+    (doubt,) = (doubt for doubt in found.against if doubt.blocking)
+    assert doubt.sentence.startswith("b.fits: ")
+    assert "in the order E1, O1, O2, E2" in doubt.sentence
+    assert found.document()["misread"] == [doubt.sentence]
+
+
 def test_exposure_groups_are_joined_where_there_are_many():
     time = np.array([3.0, 1.0, 2.0, 2.0])
     times, group = grouped(time)
@@ -230,7 +251,7 @@ def test_three_stars_that_lie_off_are_no_spot_and_no_optics():
 
 def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatch):
     """The plate that has changed may do so by a thousandth of the width of its prior only."""
-    monkeypatch.setattr("walop_jax.science.watch_readings.FARTHEST", 1e-3)
+    monkeypatch.setattr("walop_jax.science.star_columns.FARTHEST", 1e-3)
     watch = study.watched(400, 7, turned=("half2.plate.mgf2", 3.0))
     assert not watch.holds
     assert any(change.best.kind == "unnamed" and change.camera is None for change in watch.changes)
@@ -251,7 +272,7 @@ def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
     plain[..., number] = 1e-3 * like_q
     watching = Watching(dataclasses.replace(stars, plain=plain), vectors)
     size, error, _ = watching.answers(*watching.scan(stars.residual, ones))
-    column = [reading.name for reading in watching.readings.listed].index(vectors.named[number][0])
+    column = [reading.name for reading in watching.questions].index(vectors.named[number][0])
     assert np.isinf(error[:, column]).all()
     assert not size[:, column].any()
     assert (error > 0).all()

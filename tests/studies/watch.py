@@ -38,8 +38,8 @@ from walop_jax.science.apply import residuals_of  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 from walop_jax.science.overlaps import Overlap, overlap  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
+from walop_jax.science.star_words import Watch  # noqa: E402
 from walop_jax.science.watch import Watching, with_rivals  # noqa: E402
-from walop_jax.science.watch_found import Watch  # noqa: E402
 
 NIGHTS, START = 10, 6
 PLATES = (None, 22.5)

@@ -13,7 +13,7 @@ from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports.posterior_figures import unit_in_words
 from walop_jax.reports.style import AFTER, BEFORE, PAGE, QUIET, SMALL, Canvas, calendar, day_of, styled
 from walop_jax.science.quality import ERRORS, GAIN, OUTSIDE, Limits
-from walop_jax.science.watch_found import Watch
+from walop_jax.science.star_words import Watch
 
 MOST = 8  # parameters in a figure
 

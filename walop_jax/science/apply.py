@@ -1,7 +1,7 @@
 """A calibration applied to a science catalogue: q, u of every star with errors of photons and calibration.
 
 Rows are taken star by star in blocks that fit into memory. The result of a star does not depend on the rest of
-the catalogue, until all of it is looked at together (`catalogue_check`): then errors grow for all stars by what
+the catalogue, until all of it is looked at together (`star_search`): then errors grow for all stars by what
 that has found.
 """
 
@@ -26,16 +26,16 @@ from walop_jax.io.shapes import ByRowAndCamera, RowIndex
 from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
 from walop_jax.model.parameters import with_values
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.catalogue_check import NOTHING_TO_SPARE, CatalogueCheck, CatalogueSearch
 from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of, sample_of
-from walop_jax.science.catalogue_readings import Rows as ReadRows
 from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
-from walop_jax.science.instrument_changes import PossibleChange
-from walop_jax.science.left_over_sky import with_sky
-from walop_jax.science.own_light import OwnLight, OwnLightCheck, own_light_check, unpolarised
+from walop_jax.science.other_readings import Rows as ReadRows
+from walop_jax.science.star_columns import PossibleChange
+from walop_jax.science.star_light import OwnLight, unpolarised, with_sky
 from walop_jax.science.star_residuals import StarResiduals, by_place
+from walop_jax.science.star_search import CatalogueSearch, with_own_light
+from walop_jax.science.star_words import NOTHING_TO_SPARE, CatalogueCheck
 from walop_jax.sky.position_angles import sky_to_instrument
 
 QuOfStars = Float[np.ndarray, "s 2"]
@@ -107,9 +107,8 @@ def apply(
     work = _Application(AnalysisVectors(calibration), catalogue, force=force)
     chosen, few = work.sample(STAR_SAMPLE), work.sample(OWN_SAMPLE)
     readings = work.readings(chosen)
-    mended = readings is not None and bool(
-        readings.better
-    )  # what the stars say of the instrument means nothing then
+    # What the stars say of the instrument means nothing where they are not what the catalogue says.
+    mended = readings is not None and readings.mended
     blocks, watched, own = [], [], []
     for done, rows in work.blocks():
         block = work.block(rows)
@@ -119,10 +118,11 @@ def apply(
             own += work.own_light(block, few)
         if progress is not None:
             progress(done, len(catalogue))
-    check = dataclasses.replace(work.checked(watched, chosen), readings=readings, own=work.balanced(own))
+    check = dataclasses.replace(work.checked(watched, chosen), readings=readings)
+    check = work.balanced(check, own)
     if check.doubtful:
         readings = work.readings(chosen, doubted=True)
-        if readings is not None and readings.better:
+        if readings is not None and readings.mended:
             check = dataclasses.replace(NOTHING_TO_SPARE, readings=readings)
     return with_sky(work.together(_joined(blocks), check), catalogue)
 
@@ -147,6 +147,14 @@ def residuals_of(
     for _, rows_there in work.blocks():
         every += work.residuals(work.block(rows_there), chosen)
     return every
+
+
+def readings_in(
+    vectors: AnalysisVectors, catalogue: Catalogue, *, force: bool = False, doubted: bool = False
+) -> CatalogueReadings | None:
+    """Other readings of a catalogue, of which one may mend it (`catalogue_readings.readings_of`)."""
+    work = _Application(vectors, catalogue, force=force)
+    return work.readings(work.sample(STAR_SAMPLE), doubted=doubted)
 
 
 class _Block(NamedTuple):
@@ -402,13 +410,14 @@ class _Application:
         _, group = np.unique(np.nan_to_num(np.round(catalogue.time, 3)), return_inverse=True)
         place = catalogue.points.x[row], catalogue.points.y[row], group.reshape(-1)[row]
         x, y, exposure = (values[good] for values in place)
-        return [OwnLight(light.qu[good], light.noise[good], x, y, exposure, light.shifts[good], nuisances)]
+        seen = (light.qu, light.noise, light.shifts, light.cameras)
+        qu, noise, shifts, cameras = (values[good] for values in seen)
+        return [OwnLight(qu, noise, x, y, exposure, shifts, nuisances, cameras)]
 
-    def balanced(self, parts: list[OwnLight]) -> OwnLightCheck | None:
-        """What q and u of the stars say of the balance of the arms; `None` of few stars."""
+    def balanced(self, check: CatalogueCheck, parts: list[OwnLight]) -> CatalogueCheck:
+        """The check with what q and u of the stars say of the balance of the arms; nothing of few stars."""
         names = self.vectors.instrument.cameras.names
-        named = [(names[first], names[second]) for first, second in self.arms]
-        return own_light_check(OwnLight.joined(parts), named) if parts else None
+        return with_own_light(check, OwnLight.joined(parts), names, self.arms) if parts else check
 
     def checked(self, watched: list[StarResiduals], chosen: ChosenStars) -> CatalogueCheck:
         """Check of all stars together; `chosen` are those whose residuals are `watched`.
@@ -419,11 +428,8 @@ class _Application:
         """
         if not watched:
             return NOTHING_TO_SPARE
-        vectors, names = self.vectors, self.vectors.instrument.cameras.names
-        widths = [self.vectors.calibration.model[name].width for name, _ in vectors.named]
-        search = CatalogueSearch(
-            StarResiduals.joined(watched), names, vectors.named, vectors.root, widths=widths
-        )
+        vectors = self.vectors
+        search = CatalogueSearch(StarResiduals.joined(watched), vectors)
         check = search.answer()
         for _ in range(_EXPANSIONS):
             errors = None if check.holds else search.errors_of_calibration()
@@ -438,7 +444,7 @@ class _Application:
             same = joined is not None and joined.residual.shape == search.stars.residual.shape
             if joined is None or (same and search.bend(errors, joined.residual) < _STRAIGHT):
                 break
-            search = CatalogueSearch(joined, names, vectors.named, vectors.root, errors, widths)
+            search = CatalogueSearch(joined, vectors, errors)
             check = search.answer()
         return check
 
@@ -464,8 +470,9 @@ class _Application:
         def shift(entry: PossibleChange) -> QuOfStars:
             if not entry.camera:
                 return block.derivative[:, :, parameters.index(entry.name)]
-            grown, k = np.zeros_like(counts), cameras.index(entry.name)
-            grown[:, k] = check.growth.electrons(entry, *place, counts[:, k])
+            grown = np.zeros_like(counts)
+            for k in map(cameras.index, entry.members):
+                grown[:, k] = check.growth.electrons(entry, *place, counts[:, k])
             return calibration_shift(fitted.gain, fitted.relative(grown)[..., None], block.star)[..., 0]
 
         total, first = np.zeros_like(block.stars.changed), np.flatnonzero(np.diff(block.star, prepend=-1))

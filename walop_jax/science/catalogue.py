@@ -18,16 +18,23 @@ from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
 from walop_jax.io.shapes import CountsOfRows, Vector
 from walop_jax.model.instrument import Instrument
-from walop_jax.science.catalogue_doubts import errors_of_cameras, field_against_sky, units_of_counts
+from walop_jax.science.catalogue_doubts import (
+    ceilings,
+    errors_of_cameras,
+    field_against_sky,
+    many_are_full,
+    not_measured,
+    stars_of_one_name,
+    units_of_counts,
+)
 from walop_jax.science.colours import LIMITS, SOURCE, temperature_of
-from walop_jax.science.field_points import FieldPoints, doubt_radians, field_points
+from walop_jax.science.field_points import ANOTHER_PLACE, FieldPoints, doubt_radians, field_points
 from walop_jax.sky.directions import same_stars
 
 RowNumbers = Int[np.ndarray, " n"]
 ChosenRows = Bool[np.ndarray, " n"]
 _NEGATIVE = 5.0  # sigma: what noise about a subtracted background may do, and no more
 SAME_PLACE = 1.0  # arcsec
-ANOTHER_PLACE = 0.005  # deg in the field, of rows without a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +100,12 @@ def read_catalogue(
     rule = Column("float", "electron", width=cameras, shape_advice=f"one row holds all {cameras} cameras")
     counts, sigma = user_tables.vector_columns(source, ("N", "N_ERR"), rule, instrument.cameras.names)
     points, teff_err = _with_colours(source, points, place)
+    absent = not_measured(counts, sigma)
+    if absent.any():
+        which = rows_text(np.flatnonzero(absent.any(axis=1)))
+        what = f"N and N_ERR are {counts[absent][0]:g} in {which}: taken as not measured"
+        source.remarks.append(what)
+        counts, sigma = (np.where(absent, np.nan, values) for values in (counts, sigma))
     advice = "standard errors in electrons; NaN for a camera that is not to be used"
     place.refuse(np.isfinite(counts) & (sigma <= 0), "is not above 0", "N_ERR", advice)
     flagged = _flagged(source, instrument.cameras.names, place)
@@ -122,12 +135,14 @@ def read_catalogue(
     if stated.upper() != instrument.name.upper():
         doubts.insert(0, f"INSTRUME of the table is {stated}, the calibration is of {instrument.name}")
     doubts += units_of_counts(np.where(bad, np.nan, counts), sigma)
+    doubts += stars_of_one_name(star, points.x, points.y, time)
     names = instrument.cameras.names
     columns, unflagged = {"MJD": time, "TEMP": points.settings.temperature}, np.asarray(~bad.any(axis=1))
+    full = [f"{column} {what}" for column, what in ceilings(counts, unflagged, names)]
+    (doubts if many_are_full(counts) else source.remarks).extend(full)
     odd = [
         *plausible.of_columns(columns, plausible.today()),
         *plausible.of_angles("ROTATOR", rotator, radians=False),
-        *plausible.of_ceilings(counts, unflagged, names),
         *plausible.of_wraps(counts, sigma, cameras=names),
     ]
     source.remarks.extend(f"{column} {what}" for column, what in odd)

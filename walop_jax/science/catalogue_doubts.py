@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from walop_jax.data import user_tables
+from walop_jax.data import plausible, user_tables
 from walop_jax.data.user_tables import InputTable
+from walop_jax.io.errors import rows_text
 from walop_jax.io.text import with_minus_sign
-from walop_jax.science.catalogue_readings import MIRRORED
+from walop_jax.science.field_points import ANOTHER_PLACE
+from walop_jax.science.other_readings import MIRRORED
 from walop_jax.sky.directions import Pointing
 
 OfRows = Float[np.ndarray, " n"]
@@ -23,6 +25,9 @@ Counts = Float[np.ndarray, "n k"]
 
 BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
 QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
+_RELATIVE = 0.3  # error of bright stars above which N_ERR is no share of N
+_NOISIER = 10.0  # of the variance of photons: sky and detectors add to it
+_SHARE = 0.1  # of the stars, or rows, from which an oddity is about the catalogue
 _TURNED = 1.0  # deg, by which ROTATOR may differ from what positions say: convergence of meridians
 _SCALE = 0.02  # by which the scale of X and Y may
 _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
@@ -32,6 +37,16 @@ _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
 def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
     """Sentences where errors are none of electrons, so that neither they nor the counts are what they should be."""
     lit = np.isfinite(counts) & (counts > 0)
+    bright = lit & (sigma > 0) & (np.maximum(counts, sigma) > BRIGHT)
+    if bright.any():
+        n, error = counts[bright], sigma[bright]
+        if _like_photons(sigma=n, counts=error):
+            yield "N_ERR is the square of N, as counts are of their errors: were N and N_ERR exchanged? Exchange them"
+            return
+        if _like_photons(sigma=n * error, counts=n) and np.median(error) < _RELATIVE:
+            what = "N_ERR is relative to N, or in magnitudes: N · N_ERR, not N_ERR, is the noise of photons"
+            yield f"{what}; multiply it by N (and by 0.921 if it is in magnitudes)"
+            return
     if lit.any() and (share := float(np.median(sigma[lit] ** 2 / counts[lit]))) < QUIET:
         what = f"N_ERR is {share**-0.5:.2g} times smaller than the noise of photons"
         number = f"both would be those of photons if they were multiplied by {1.0 / share:.3g}"
@@ -43,6 +58,11 @@ def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
     if bright.any() and (share := float(np.median(sigma[bright] / counts[bright]))) > 0.5:
         number = f"the root of N_ERR is {float(np.median(np.sqrt(sigma[bright] / counts[bright]))):.2g} times that of N"
         yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted; {number}"
+
+
+def _like_photons(sigma: OfRows, counts: OfRows) -> bool:
+    """True if errors are those of counts in electrons, with a noise of sky and detectors as it is usual."""
+    return 0.8 < float(np.median(sigma**2 / counts)) < _NOISIER
 
 
 def field_against_sky(source: InputTable, x: OfRows, y: OfRows, rotator: OfRows) -> Iterator[str]:
@@ -113,3 +133,48 @@ def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> It
             yield f"N_ERR of {name} is larger than N in all rows: are the columns exchanged, or is it in another unit?"
         if on.sum() >= _FEWEST and np.ptp(error[on]) == 0.0 and np.ptp(n[on]) > 0.0:
             yield f"N_ERR of {name} is {error[on][0]:g} in all rows, whatever N is: is it a placeholder?"
+
+
+def not_measured(counts: Counts, sigma: Counts) -> Bool[np.ndarray, "n k"]:
+    """Where N and N_ERR are one negative number, as catalogues have it in the place of what was not measured."""
+    return (counts < 0) & (counts == sigma)
+
+
+def stars_of_one_name(star: Int[np.ndarray, " n"], x: OfRows, y: OfRows, time: OfRows) -> Iterator[str]:
+    """A sentence where rows of one star lie at several places of the field at one time."""
+    dated = np.flatnonzero(np.isfinite(time + x + y))
+    exposure = np.unique(time[dated], return_inverse=True)[1].reshape(-1)
+    _, of = np.unique(np.stack([star[dated], exposure], axis=1), axis=0, return_inverse=True)
+    of = of.reshape(-1)
+    extent = np.zeros(of.max(initial=-1) + 1)
+    for values in (x[dated], y[dated]):
+        low, high = np.full(len(extent), np.inf), np.full(len(extent), -np.inf)
+        np.minimum.at(low, of, values)
+        np.maximum.at(high, of, values)
+        extent = np.maximum(extent, high - low)
+    apart = int(np.sum(extent > ANOTHER_PLACE))
+    if apart > _SHARE * len(extent):
+        what = f"ID: {apart} of {len(extent)} stars are at several places of the field at one MJD"
+        yield f"{what}: is one number that of several stars? Give each star a number of its own"
+
+
+def ceilings(
+    counts: Counts, used: Bool[np.ndarray, " n"], names: Sequence[str]
+) -> Iterator[plausible.Implausible]:
+    """Counts that are the largest of their camera in several rows: those of all cameras at once are one sentence."""
+    top = np.nanmax(np.where(used[:, None], counts, -np.inf), initial=-np.inf)
+    full = (counts == top) & used[:, None]
+    if full.any(axis=0).sum() > 1 and full.any(axis=1).sum() >= _FEWEST:
+        which = rows_text(np.flatnonzero(full.any(axis=1)))
+        what = f"is exactly {top:.10g}, the largest, of several cameras in {which}"
+        yield plausible.Implausible(
+            "N", f"{what}: the ceiling of the detectors? Set FLAG 1 (saturated) there"
+        )
+    else:
+        yield from plausible.of_ceilings(counts, used, names)
+
+
+def many_are_full(counts: Counts) -> bool:
+    """True where the largest number of all cameras is there in too many rows to be left to single stars."""
+    full = counts == np.nanmax(counts, initial=-np.inf)
+    return bool(np.mean(full.any(axis=1)) > _SHARE and full.sum() >= _FEWEST)

@@ -1,138 +1,82 @@
 """Mistakes in a catalogue, tried where its stars contradict the calibration: other readings of the same rows.
 
-Cameras in another order, a rotator of the wrong sign, a field that is mirrored, turned or shifted, magnitudes for
-intensities, another filter, other gains: each makes residuals that no change of an instrument makes, and each is
-undone by rewriting the rows. A reading is judged by a few hundred bright stars, with
+Cameras in another order, a rotator of the wrong sign, a field that is mirrored, turned, shifted or stretched, radians,
+magnitudes for intensities, another filter, other gains: each makes residuals that no change of an instrument makes, and
+each is undone by rewriting the rows (`other_readings`). Readings are tried where more than a tenth of the stars
+disagree; exchanges within arms always. What makes the loss smaller by `BETTER` and lets the stars
+agree is reported, with all that do so as well.
 
-    Σ min(χ², `CAP` ν) + 4 n ln s        χ² of a star with `FLOOR` of its light added to the errors,
-                                         s the robust scatter of q and u of the n stars that measure them,
-
-the second because two cameras of one arm can be exchanged without a trace in χ²: the cross-talk, wrongly taken out,
-then stays in q and u. Readings are tried where more than a tenth of the stars disagree; exchanges within arms always.
-What makes the sum smaller by `BETTER` and lets the stars agree is reported, with all that do so as well.
+Rows in which one camera holds another star than the others are no reading: its light differs from theirs by factors
+that no polarisation of stars makes (`APART`), either way. Where they are many they are told ahead of all readings.
 
 Limits      One mistake at a time. A ROTATOR that is wrong beside right X and Y turns q and u of all stars alike: only
-            rows of one star at several rotators, or RA and DEC, show it.
+            rows of one star at several rotators, or RA and DEC, show it. A wrong FILTER shows where the cross-talk or
+            the shares of the cameras differ between the two by more than the noise of the stars.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy import optimize, special
 
-from walop_jax.calibration.analysis_vectors import COLOURS, AnalysisVectors, colour_weights
-from walop_jax.data.settings import BUILTIN_FILTERS, Settings
-from walop_jax.instruments.description import shipped
-from walop_jax.io.text import with_minus_sign
-from walop_jax.model.cameras import other_orders
-from walop_jax.science.estimate import estimate
-from walop_jax.science.instrument_changes import LARGEST
-from walop_jax.sky.position_angles import sky_to_instrument
+from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.science import other_readings as tried_as
+from walop_jax.science.other_readings import FEWEST, CatalogueReading, Fit, Judge, Rows
 
 STARS = 300  # that are looked at
-FEWEST = 8
 DISAGREE = 0.1
 """Share of the stars from which on readings are tried."""
-IMPROBABLE = 1e-3  # probability of a χ² as large below which a star disagrees
-FLOOR = 0.002  # of the light: what a calibration or a flat field may be off by, and nobody minds
-CAP = 50.0  # χ² per degree of freedom beyond which a star is off, however far
 BETTER, ALIKE = 60.0, 30.0  # of the sum, by which a reading must improve it; within which others are as good
-KNOWN = 0.1  # error of q and u together from which a star says nothing of their scatter
-_STILL = 0.002  # scatter of q and u that is not told from none
-_MAGNITUDES = 40.0  # |N| that no magnitude reaches
-_STEP = 5.0  # deg, of turns of the field that are tried
-_SHIFTS = 8  # to either side, in the range that is tried: …
-_FINE = 0.005  # deg, about what a part of the stars says
-_RANGE = 0.75  # … this share of the field
-_SEARCHED = 100  # stars that turns and shifts are searched with
-_CONVERGENCE = 3.0  # deg, of the meridians over a field
-
-OfRows = Float[np.ndarray, " r"]
-Turn = Callable[[OfRows, OfRows], tuple[OfRows, OfRows]]
+APART = 1.5
+"""Factor by which a camera must differ from the others to hold another star; these differ by its root at most."""
+_AGREEING = 3  # cameras that must agree on a star
+_BRIGHT = 0.05  # relative error of a camera up to which a row is asked for other stars
 
 
-@dataclasses.dataclass(frozen=True)
-class Rows:
-    """Rows of whole stars: field positions and ROTATOR (deg; NaN: none), counts and errors (electron), settings.
+class OtherStars(NamedTuple):
+    """The `camera` that holds other stars than the others in `rows` of the `bright` rows of a sample."""
 
-    `star` numbers the stars from 0 in ascending order. `rewritten` is True where counts are other than they were given.
-    """
+    camera: str
+    rows: int
+    bright: int
 
-    star: Int[np.ndarray, " r"]
-    x: OfRows
-    y: OfRows
-    rotator: OfRows
-    counts: Float[np.ndarray, "r k"]
-    sigma: Float[np.ndarray, "r k"]
-    settings: Settings
+    @property
+    def many(self) -> bool:
+        """True if they are too many for blends."""
+        return self.rows > DISAGREE * self.bright
 
-    def of(self, keep: Bool[np.ndarray, " r"]) -> Rows:
-        """Some of the rows, of whole stars."""
-        arrays = {n: v[keep] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
-        arrays["star"] = np.unique(arrays["star"], return_inverse=True)[1].reshape(-1)
-        return Rows(**arrays, settings=self.settings[np.flatnonzero(keep)])
-
-    def changed(self, **columns: Any) -> Rows:
-        """The same with other columns."""
-        return dataclasses.replace(self, **columns)
-
-
-class Fit(NamedTuple):
-    """How well stars agree with a reading: the sum of the head of this file, the share that disagrees, the scatter s.
-
-    `misfit` is the part of χ² in the sum, of which `dof` is expected at most.
-    """
-
-    loss: float
-    disagree: float
-    scatter: float
-    misfit: float = np.inf
-    dof: float = 0.0
-
-
-NO_FIT = Fit(np.inf, 1.0, np.inf)
-"""Of rows that a reading cannot be of."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CatalogueReading:
-    """Another reading of a catalogue: what must have happened, what to do about it, how well the stars agree then.
-
-    `usual` are changes as instruments have them: no mistake of the catalogue.
-    """
-
-    what: str
-    remedy: str
-    change: Callable[[Rows], Rows]
-    fit: Fit = NO_FIT
-    usual: bool = False
-
-    def document(self) -> dict[str, Any]:
-        """The reading as plain data."""
-        return {
-            "what": self.what,
-            "remedy": self.remedy,
-            "disagree": self.fit.disagree,
-            "scatter": self.fit.scatter,
-        }
+    def words(self) -> str:
+        """The finding in a sentence."""
+        return (
+            f"N of {self.camera} are those of other stars in {self.rows} of {self.bright} bright rows: they differ "
+            f"from all other cameras by a factor of {APART:g} or more, either way (match its stars with theirs anew)"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class CatalogueReadings:
-    """How a catalogue of so many `stars` (a sample) agrees as it stands, and the readings that mend it, best first."""
+    """How a catalogue of so many `stars` (a sample) agrees as it stands, and the readings that mend it, best first.
+
+    `others` is the camera that holds other stars in most rows (None: none does in any).
+    """
 
     stars: int
     stands: Fit
     better: tuple[CatalogueReading, ...] = ()
+    others: OtherStars | None = None
+
+    @property
+    def mended(self) -> bool:
+        """True if the catalogue is not what it says, and what it should be is known."""
+        return bool(self.better) or (self.others is not None and self.others.many)
 
     def words(self) -> str:
         """What is wrong, in a sentence."""
+        if self.others is not None and self.others.many:
+            return self.others.words()
         reasons = "; or if ".join(f"{reading.what} ({reading.remedy})" for reading in self.better)
         number, best = round(self.stands.disagree * self.stars), self.better[0].fit
         then = f"{round(best.disagree * self.stars)} of {self.stars}"
@@ -149,6 +93,7 @@ class CatalogueReadings:
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
         about = {"stars": self.stars, "disagree": self.stands.disagree, "scatter": self.stands.scatter}
+        about |= {"other_stars": None if self.others is None else self.others._asdict()}
         return {**about, "readings": [reading.document() for reading in self.better]}
 
 
@@ -166,95 +111,48 @@ def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) 
     if not np.isfinite(stands.loss):
         return None
     cameras = vectors.instrument.cameras
+    others = _other_stars(judge, rows)
+    if others is not None and others.many:
+        return CatalogueReadings(count, stands, (), others)
     arms = [arm for arm in cameras.arms if len(arm) > 1]
-    tries: list[Iterable[CatalogueReading]] = [[*orders(cameras.names, arms), *_units(rows)]]
+    always = [*tried_as.orders(cameras.names, arms), *tried_as.units(rows)]
+    tries: list[Iterable[CatalogueReading]] = [always]
     if doubted or stands.disagree > DISAGREE:
-        named = [*orders(cameras.names), *_units(rows), *_fields(), *_rotators(rows)]
-        tries = [named, _turns(judge, rows), _shifts(judge, rows), _filters(vectors, rows)]
-        tries += [_gains(judge, rows), _all_gains(judge, rows)]
-    gains = [judge.judged(item, rows) for item in _gains(judge, rows)] if len(tries) > 1 else []
+        named = [
+            *tried_as.orders(cameras.names),
+            *tried_as.units(rows),
+            *tried_as.fields(),
+            *tried_as.rotators(rows),
+            *tried_as.radians(judge, rows),
+        ]
+        tries = [
+            named,
+            tried_as.turns(judge, rows),
+            tried_as.scales(judge, rows),
+            tried_as.shifts(judge, rows),
+            tried_as.filters(vectors, rows),
+        ]
+        tries += [tried_as.gains(judge, rows), tried_as.all_gains(judge, rows)]
+    gains = [judge.judged(item, rows) for item in tried_as.gains(judge, rows)] if len(tries) > 1 else []
     usual = min((item.fit.loss for item in gains if item.usual), default=np.inf)
     for tried in tries:
         judged = [judge.judged(item, rows) for item in tried if not item.usual]
-        good = sorted((item for item in judged if _mends(item.fit, stands)), key=lambda item: item.fit.loss)
+        good = sorted((item for item in judged if _mends(item, stands)), key=lambda item: item.fit.loss)
         if good and usual < good[0].fit.loss + ALIKE:
             break
         if good:
             alike = tuple(item for item in good if item.fit.loss < good[0].fit.loss + ALIKE)
-            return CatalogueReadings(count, stands, alike)
-    return CatalogueReadings(count, stands)
+            return CatalogueReadings(count, stands, alike, others)
+    return CatalogueReadings(count, stands, (), others)
 
 
-def _mends(fit: Fit, stands: Fit) -> bool:
-    """True if the stars agree, as they do not as the catalogue stands."""
+def _mends(reading: CatalogueReading, stands: Fit) -> bool:
+    """True if the stars agree with a reading, as they do not as the catalogue stands."""
+    fit = reading.fit
     agrees = fit.disagree <= max(stands.disagree / 3.0, 0.5 * DISAGREE)
     excess, before = fit.misfit - fit.dof, max(stands.misfit - stands.dof, 0.0)
-    return fit.loss < stands.loss - BETTER and agrees and excess <= before / 4.0
-
-
-class Judge:
-    """Fits of rows by a calibration, by its tables of vectors."""
-
-    def __init__(self, vectors: AnalysisVectors) -> None:
-        self.vectors = vectors
-
-    def judged(self, reading: CatalogueReading, rows: Rows) -> CatalogueReading:
-        """A reading with how well it fits; not at all where it cannot be made."""
-        try:
-            return dataclasses.replace(reading, fit=self.fit(reading.change(rows)))
-        except (ValueError, np.linalg.LinAlgError):
-            return reading
-
-    def vectors_at(self, rows: Rows) -> Float[np.ndarray, "r k 3"]:
-        """Analysis vectors of rows in the frame of the instrument."""
-        settings = self.vectors.reduced(rows.settings)
-        found = np.empty((len(rows.x), self.vectors.cameras, 3))
-        for setting, same in settings.optics():
-            teff = settings.teff[same]
-            spectra = self.vectors.at(setting, rows.x[same], rows.y[same])
-            found[same] = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
-        return found
-
-    def within(self, rows: Rows) -> Rows:
-        """Rows of stars that lie in the field."""
-        outside = np.maximum(np.abs(rows.x), np.abs(rows.y)) > self.vectors.half_width
-        return rows.of(np.bincount(rows.star, outside)[rows.star] == 0) if outside.any() else rows
-
-    def unpolarised(self, rows: Rows) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, "r k"]]:
-        """Counts of the rows in the field, and those of unpolarised stars of unit flux."""
-        rows = self.within(rows)
-        return rows.counts, self.vectors_at(rows)[..., 0]
-
-    def fit(self, rows: Rows) -> Fit:
-        """How well rows agree; stars beyond the field do not count, unless most lie there."""
-        count = int(rows.star.max()) + 1
-        rows = self.within(rows)
-        if len(rows.x) == 0 or rows.star.max() + 1 < 0.5 * count:
-            return NO_FIT
-        vectors = self.vectors_at(rows)
-        sky = np.isfinite(rows.rotator)
-        turn = np.where(sky, rows.rotator, 0.0)
-        axes = sky_to_instrument(vectors[..., 1], vectors[..., 2], -turn[:, None])
-        on_sky = np.stack([vectors[..., 0], *axes], axis=-1)
-        sigma = np.hypot(rows.sigma, FLOOR * np.abs(np.nan_to_num(rows.counts)))
-        found = estimate(on_sky, rows.counts, sigma, rows.star, self.vectors.instrument.cameras)
-        good = np.isfinite(found.qu).all(axis=1) & (found.dof > 0)
-        off = np.where(good, found.chi2, np.inf)
-        dof = np.maximum(found.dof, 1)
-        limit = special.chdtri(dof, IMPROBABLE)
-        loss = np.minimum(off, CAP * dof)
-        with np.errstate(invalid="ignore"):
-            clear = good & (np.trace(found.photon, axis1=1, axis2=2) < KNOWN**2)
-        number, scatter = int(clear.sum()), _STILL
-        if number >= FEWEST:
-            away = found.qu[clear] - np.median(found.qu[clear], axis=0)
-            square = float(np.median(np.sum(away**2, axis=1))) / (2.0 * np.log(2.0))
-            scatter = float(np.hypot(np.sqrt(square), _STILL))
-        share = count / max(len(loss), 1)
-        total = share * (float(loss.sum()) + 4.0 * number * float(np.log(scatter)))
-        return Fit(
-            total, float(np.mean(off > limit)), scatter, share * float(loss.sum()), share * float(dof.sum())
-        )
+    sums = not reading.searched or fit.misfit < stands.misfit - BETTER
+    return fit.loss < stands.loss - BETTER and agrees and sums and excess <= before / 4.0
 
 
 def sample_of(rows: Rows) -> Rows:
@@ -273,226 +171,24 @@ def sample_of(rows: Rows) -> Rows:
     return rows.of(chosen[rows.star])
 
 
-# ----------------------------------------------------------------------------------------------- the readings
-
-
-def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) -> Iterator[CatalogueReading]:
-    """Other orders of the cameras: all, or with `arms` those that leave each arm its cameras."""
-    count = len(names)
-    if arms is not None:
-        flips = itertools.product((False, True), repeat=len(arms))
-        tried = []
-        for flip in flips:
-            order = list(range(count))
-            for arm, turned in zip(arms, flip, strict=True):
-                for k, other in zip(arm, reversed(arm) if turned else arm, strict=True):
-                    order[k] = other
-            tried.append(tuple(order))
-        tried = [order for order in tried if order != tuple(range(count))]
-    else:
-        tried = other_orders(count)
-    for order in tried:
-        held = ", ".join(names[int(k)] for k in np.argsort(order))
-        yield CatalogueReading(
-            f"the columns of N and N_ERR were in the order {held}",
-            f"their order is {', '.join(names)}: exchange the files or columns",
-            lambda r, at=list(order): r.changed(counts=r.counts[:, at], sigma=r.sigma[:, at]),
-        )
-
-
-def _units(rows: Rows) -> Iterator[CatalogueReading]:
-    """Magnitudes in the place of intensities."""
-    if rows.counts.size and np.nanmax(np.abs(rows.counts)) < _MAGNITUDES:
-
-        def intensities(r: Rows) -> Rows:
-            counts = 10.0 ** (-0.4 * (r.counts - np.nanmedian(r.counts)))
-            return r.changed(counts=counts, sigma=0.4 * np.log(10.0) * counts * r.sigma)
-
-        yield CatalogueReading(
-            "N were magnitudes", "give intensities in electrons: they add up, magnitudes do not", intensities
-        )
-
-
-def _placed(turn: Turn) -> Callable[[Rows], Rows]:
-    def change(rows: Rows) -> Rows:
-        x, y = turn(rows.x, rows.y)
-        return rows.changed(x=x, y=y)
-
-    return change
-
-
-MIRRORED: tuple[tuple[str, str, Turn], ...] = (
-    ("X and Y were exchanged", "exchange them", lambda x, y: (y, x)),
-    ("X ran the other way", "give −X", lambda x, y: (-x, y)),
-    ("Y ran the other way", "give −Y", lambda x, y: (x, -y)),
-    ("X and Y were exchanged and ran the other way", "give −Y as X, and −X as Y", lambda x, y: (-y, -x)),
-)
-"""Mistakes by which the field is a mirror image of itself."""
-
-
-def _fields() -> Iterator[CatalogueReading]:
-    for what, remedy, turn in MIRRORED:
-        yield CatalogueReading(what, remedy, _placed(turn))
-
-
-def turned(x: OfRows, y: OfRows, angle: float | OfRows) -> tuple[OfRows, OfRows]:
-    """X and Y of the same stars if ROTATOR were larger by an angle (deg)."""
-    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-    return c * x + s * y, c * y - s * x
-
-
-def _rotators(rows: Rows) -> Iterator[CatalogueReading]:
-    """ROTATOR of another sign, zero or unit, where X and Y were made with it, and where they were not."""
-    known = np.isfinite(rows.rotator)
-    if not known.all():
-        return
-    typical = float(np.rad2deg(np.angle(np.mean(np.exp(1j * np.deg2rad(rows.rotator))))))
-    changes: list[tuple[str, str, Callable[[OfRows], OfRows]]] = []
-    changes.append(("ROTATOR had the wrong sign", "give −ROTATOR", lambda r: -r))
-    for quarters in (90.0, 180.0, -90.0):
-        what = f"ROTATOR were {abs(quarters):g}° {'larger' if quarters > 0 else 'smaller'}"
-        changes.append((what, "correct it (docs: conventions)", lambda r, d=quarters: r + d))
-    if np.abs(rows.rotator).max() <= 2.0 * np.pi:
-        changes.append(("ROTATOR were in radians", "give degrees, or the unit of the column", np.rad2deg))
-    # ROTATOR differs between the stars of one pointing by the convergence of the meridians.
-    one = bool(np.all(np.cos(np.deg2rad(rows.rotator - typical)) > np.cos(np.deg2rad(_CONVERGENCE))))
-    several = np.ptp(np.cos(2.0 * np.deg2rad(rows.rotator - typical))) > 0.1
-    made = "; X and Y are made with it"
-    for what, remedy, change in changes:
-
-        def both(r: Rows, change: Callable[[OfRows], OfRows] = change) -> Rows:
-            centre = np.full(len(r.x), typical) if one else r.rotator
-            turn = change(centre) - centre
-            x, y = turned(r.x, r.y, turn)
-            return r.changed(x=x, y=y, rotator=r.rotator + turn)
-
-        number = with_minus_sign(f"{change(np.array([typical]))[0]:.4g}")
-        size = f", {number}° in place of {with_minus_sign(f'{typical:.4g}')}°"
-        yield CatalogueReading(what + size, remedy + made, both)
-        if several:
-            yield CatalogueReading(
-                what, remedy, lambda r, change=change: r.changed(rotator=change(r.rotator))
-            )
-
-
-def _turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
-    """The field turned by any angle, which is searched."""
-    few = _some_of(rows)
-
-    def loss(angle: float) -> float:
-        return judge.fit(_placed(lambda x, y: turned(x, y, angle))(few)).misfit
-
-    angles = np.arange(_STEP, 360.0, _STEP)
-    losses = [loss(float(angle)) for angle in angles]
-    start = float(angles[int(np.argmin(losses))])
-    best: Any = optimize.minimize_scalar(loss, bounds=(start - _STEP, start + _STEP), method="bounded")
-    angle = (float(best.x) + 180.0) % 360.0 - 180.0
-    number = with_minus_sign(f"{angle:+.2f}")
-    yield CatalogueReading(
-        f"X and Y were turned by {number}°, as a ROTATOR that is {number}° larger turns them",
-        "correct the rotator of the pointing",
-        _placed(lambda x, y: turned(x, y, angle)),
-    )
-
-
-def _shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
-    """The field shifted, by what is searched."""
-    few, reach = _some_of(rows), _RANGE * judge.vectors.half_width
-
-    def moved(shift: Float[np.ndarray, " 2"]) -> Callable[[Rows], Rows]:
-        dx, dy = shift.tolist()
-        return _placed(lambda x, y: (x + dx, y + dy))
-
-    def misfit(shift: Float[np.ndarray, " 2"], of: Rows = few) -> float:
-        return min(judge.fit(moved(shift)(of)).misfit, 1e30)
-
-    steps = np.linspace(-reach, reach, 2 * _SHIFTS + 1)
-    best = min((np.array(pair) for pair in itertools.product(steps, steps)), key=misfit)
-    for of, step in ((few, 0.5 * reach / _SHIFTS), (rows, _FINE)):
-        simplex = best + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        options = {"xatol": 1e-4, "fatol": 0.1, "initial_simplex": simplex, "maxiter": 120}
-        best = optimize.minimize(misfit, best, (of,), method="Nelder-Mead", options=options).x
-    x, y = (with_minus_sign(f"{value:+.4f}") for value in best)
-    where = ""
-    known = rows.rotator[np.isfinite(rows.rotator)]
-    if known.size:
-        angle = np.angle(np.mean(np.exp(1j * np.deg2rad(known))))
-        east = best[0] * np.sin(angle) + best[1] * np.cos(angle)
-        north = best[0] * np.cos(angle) - best[1] * np.sin(angle)
-        sides = (
-            f"{abs(east):.4f}° {'west' if east > 0 else 'east'}",
-            f"{abs(north):.4f}° {'south' if north > 0 else 'north'}",
-        )
-        where = f": the field centre lies {' and '.join(sides)} of the one that was taken"
-    yield CatalogueReading(
-        f"all stars lay at X {x}° and Y {y}° from where they are said to be{where}",
-        "correct RA and DEC of the pointing, or the zero of X and Y",
-        moved(best),
-    )
-
-
-def _some_of(rows: Rows) -> Rows:
-    """Every n-th star of rows, some `_SEARCHED` of them."""
-    every = -(-(int(rows.star.max()) + 1) // _SEARCHED)
-    return rows.of(rows.star % every == 0)
-
-
-def _filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[CatalogueReading]:
-    """Other filters, where all rows are of one."""
-    stated = np.unique(rows.settings.filter)
-    if len(stated) > 1:
-        return
-    held = vectors.calibration
-    names = dict.fromkeys([*np.unique(held.exposures.filter).tolist(), *held.filters, *BUILTIN_FILTERS])
-    for name in names:
-        if name != stated[0]:
-
-            def change(r: Rows, name: str = name) -> Rows:
-                other = dataclasses.replace(r.settings, filter=np.full(len(r.x), name))
-                return r.changed(settings=other)
-
-            yield CatalogueReading(
-                f"they were seen in {name}", f"correct FILTER, which says {stated[0]}", change
-            )
-
-
-def _gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
-    """Another gain of one camera, or of one arm, by which unpolarised stars have the shares of the calibration."""
-    cameras = judge.vectors.instrument.cameras
-    names, count = cameras.names, len(cameras)
-    counts, expected = judge.unpolarised(rows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sets = [(k,) for k in range(count)] + [tuple(arm) for arm in cameras.arms if 1 < len(arm) < count]
-        for members in sets:
-            k, rest = list(members), [n for n in range(count) if n not in members]
-            own, other = (counts[:, at].sum(axis=1) / expected[:, at].sum(axis=1) for at in (k, rest))
-            factor = float(np.nanmedian(other / own))
-            if np.isfinite(factor) and factor > 0:
-                which = " and ".join(names[n] for n in members)
-                yield CatalogueReading(
-                    f"N of {which} were {factor:.4g} times as large",
-                    "is that of one gain, unit, aperture and exposure with the other cameras?",
-                    _scaled(np.where(np.isin(np.arange(count), k), factor, 1.0)),
-                    usual=abs(factor - 1.0) <= LARGEST,
-                )
-
-
-def _all_gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
-    """Other gains of all cameras: those of another instrument, say."""
+def _other_stars(judge: Judge, rows: Rows) -> OtherStars | None:
+    """The camera whose light in some rows is not that of the star that all others see; None where none is so."""
     names = judge.vectors.instrument.cameras.names
-    counts, expected = judge.unpolarised(rows)
+    inside = judge.within(rows)
+    if not len(inside.x) or len(names) < _AGREEING + 1:
+        return None
+    counts, expected = judge.unpolarised(inside)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = counts / expected
-        factors = np.nanmedian(ratio.mean(axis=1, keepdims=True) / ratio, axis=0)
-    if np.isfinite(factors).all() and (factors > 0).all():
-        others = " or ".join(name for name in shipped() if name != judge.vectors.instrument.name)
-        listed = ", ".join(f"{factor:.4g}" for factor in factors)
-        yield CatalogueReading(
-            f"N of {', '.join(names)} were {listed} times as large",
-            f"are they of the calibrated instrument, and not of {others} or another one; are all cameras in one unit?",
-            _scaled(factors),
-        )
-
-
-def _scaled(factors: Float[np.ndarray, " k"]) -> Callable[[Rows], Rows]:
-    return lambda rows: rows.changed(counts=rows.counts * factors, sigma=rows.sigma * factors)
+        light = np.log(counts / expected)
+        bright = (inside.sigma < _BRIGHT * counts).all(axis=1) & np.isfinite(light).all(axis=1)
+    light, limit = light[bright], float(np.log(APART))
+    if len(light) < FEWEST:
+        return None
+    light = light - np.median(light, axis=0)  # gains are no other stars
+    number = []
+    for k in range(len(names)):
+        others = np.delete(light, k, axis=1)
+        agree = np.ptp(others, axis=1) < 0.5 * limit
+        number.append(int(np.sum(agree & (np.abs(light[:, k] - others.mean(axis=1)) > limit))))
+    worst = int(np.argmax(number))
+    return OtherStars(names[worst], number[worst], len(light)) if number[worst] else None

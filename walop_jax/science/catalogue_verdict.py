@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,6 +12,7 @@ from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.science.apply import Stars
 from walop_jax.science.catalogue import Catalogue
 from walop_jax.science.overlaps import Overlap
+from walop_jax.science.star_words import CORRECT, LOOK
 
 MOST = 0.5
 """Share of the stars from which bits of FLAG are about the catalogue, not about single stars."""
@@ -20,12 +22,10 @@ OF_STARS = {
     Quality.BEYOND_SETTINGS: "give the calibration of this filter and temperature",
     Quality.VALIDITY_FORCED: "give the calibration of this filter and temperature, without --force",
     Quality.DISAGREES: "check the background, the order of the cameras and the unit of N",
-    Quality.PLACE: "look for dust, a ghost or a bright neighbour at that place",
+    Quality.PLACE: LOOK,
     Quality.REPEATED: "leave out the rows that are there twice",
 }
 """Bits of FLAG of which most stars should have none, with a remedy."""
-CORRECT = "correct the catalogue, and apply the calibration again"
-DATE_IT = "walop-jax check RUN STARS... dates it; new calibration exposures measure it"
 
 
 def verdict_on(
@@ -39,13 +39,9 @@ def _against(
     calibration: Calibration, rows: Catalogue, stars: Stars, seen_twice: Overlap | None
 ) -> Iterator[Doubt]:
     check, of_fit = stars.check, calibration.verdict
-    places = tuple(f"{place.words()} (FLAG {Quality.PLACE:d})" for place in check.places)
-    said = [f"{text} (FLAG {Quality.CATALOGUE:d})" for text in check.warnings()]
-    remedy = CORRECT if check.misread else DATE_IT
     of_check = [
-        Doubt(Quality.CATALOGUE, text, remedy=remedy)
-        for text in said
-        if not any(place.words() in text for place in check.places)
+        dataclasses.replace(doubt, sentence=f"{doubt.sentence} (FLAG {doubt.bit:d})")
+        for doubt in check.against
     ]
     if check.misread:
         yield from of_check
@@ -70,9 +66,6 @@ def _against(
         share = float(np.mean(stars.flag & bit > 0)) if len(stars.flag) else 0.0
         if share > MOST and not of_fit.quality & bit:
             yield Doubt(bit, f"FLAG {bit:d} of {100 * share:.0f} % of the stars: {bit.meaning}", remedy=cure)
-    if not check.misread:
-        for text in places:
-            yield Doubt(Quality.PLACE, text, blocking=False, remedy=OF_STARS[Quality.PLACE])
     if of_fit.trusted:
         for text in calibration.warnings:
             yield Doubt(

@@ -17,6 +17,7 @@ from walop_jax.io.errors import rows_text
 from walop_jax.model.dependence import needs
 from walop_jax.model.instrument import Instrument
 
+ANOTHER_PLACE = 0.005  # deg: positions that lie farther apart are two places of the field
 _SINGLE = 1  # point: it may lie outside without a doubt about its unit
 _WHOLE = 1e-4  # deg: angles in radians that are so close to whole degrees are not read as degrees
 _FINITE = finite("correct or remove these rows")
@@ -131,7 +132,7 @@ def field_points(
         what = (
             f"most points lie outside ±{limit:g}° of {instrument.name}: {rows_text(np.flatnonzero(outside))}"
         )
-        raise place.fail(what, "X, Y", "field coordinates are in degrees: are these arcmin or pixels?")
+        raise place.fail(what, "X, Y", _beyond(x[~lost], y[~lost], limit))
     for name, condition, assumed in _ASSUMED:
         if name not in source.names and condition in needs(instrument).conditions:
             what = f"is missing, and the optics of this calibration depend on it: {assumed} is assumed"
@@ -180,3 +181,13 @@ def true_matrices(
     names = f"{names[0]} … {names[-1]}"
     Place(path, "").refuse(~np.isfinite(matrix), "not finite", names, "remove these rows")
     return points.x, points.y, matrix
+
+
+def _beyond(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], limit: float) -> str:
+    """What positions (deg) may be of which most lie beyond ±`limit`."""
+    middle = [0.5 * float(values.min() + values.max()) for values in (x, y)]
+    inside = max(float(np.ptp(x)), float(np.ptp(y))) <= 2.0 * limit
+    if inside:
+        where = f"X smaller by {middle[0]:.3g}° and Y by {middle[1]:.3g}°"
+        return f"with {where} all would lie inside: is their zero the corner of the frame? It is the field centre"
+    return "field coordinates are in degrees: are these arcmin or pixels?"

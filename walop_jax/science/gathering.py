@@ -195,12 +195,26 @@ def _place(catalogue: CameraCatalogue, pointing: Pointing) -> Float[np.ndarray, 
     if (typical := float(np.median(away))) > FARTHEST:
         centre = f"RA {pointing.ra:.5g}, DEC {pointing.dec:.5g} deg"
         what = f"its stars lie {typical:.3g} deg from the field centre {centre}"
-        advice = "is it of another field? Is the centre in degrees (--ra, --dec)?"
-        raise fail(what, file=catalogue.path, advice=advice)
+        raise fail(what, file=catalogue.path, advice=_another_centre(catalogue, pointing))
     near = away < 60.0
     place = np.full((len(catalogue), 2), np.inf)
     place[near] = np.stack(pointing.field_of(catalogue.ra[near], catalogue.dec[near]), axis=1)
     return place
+
+
+def _another_centre(catalogue: CameraCatalogue, pointing: Pointing) -> str:
+    """What may be wrong with a centre that is far from all stars: the mistake that would put it among them."""
+    ra, dec = pointing.ra, pointing.dec
+    mistakes = {
+        "is RA in hours?": (15.0 * ra, dec),
+        "has DEC lost its sign?": (ra, -dec),
+        "is RA in hours, and has DEC lost its sign?": (15.0 * ra, -dec),
+    }
+    for words, (there, up) in mistakes.items():
+        away = directions.separation(there % 360.0, up, catalogue.ra, catalogue.dec)
+        if float(np.median(away)) <= FARTHEST:
+            return f"{words} Its stars would lie there; give degrees (--ra, --dec)"
+    return "is it of another field? Is the centre in degrees (--ra, --dec)?"
 
 
 def _registrations(

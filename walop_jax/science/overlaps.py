@@ -18,7 +18,7 @@ from scipy import special
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.science.apply import STAR_SAMPLE, apply
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.instrument_changes import ALARM
+from walop_jax.science.star_columns import ALARM
 
 APART = 0.02  # deg: rows of a star that lie farther apart than that are at two places
 COMMON = float(special.chdtri(1, ALARM))  # square of a normal deviate that is exceeded with that probability

@@ -29,7 +29,7 @@ from scipy import special
 from walop_jax.likelihood.flux import FluxGroups, project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.optics import through_series
-from walop_jax.science.catalogue import ANOTHER_PLACE
+from walop_jax.science.field_points import ANOTHER_PLACE
 
 CHECKED_ROWS = 2048
 """Rows whose columns for the check of a catalogue are worked on together: a hundred columns of them take 7 MB."""

@@ -13,10 +13,10 @@ from walop_jax.io.text import in_ascii
 from walop_jax.model.instrument import Instrument
 from walop_jax.science.apply import Stars
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.catalogue_check import CatalogueCheck
 from walop_jax.science.colours import COOL, HOT
 from walop_jax.science.overlaps import extents
 from walop_jax.science.polarisation import polarisation
+from walop_jax.science.star_words import CatalogueCheck
 
 FEW = 0.5  # of the rows
 APART = 0.005  # deg: rows of one star that lie farther apart may be those of two

@@ -26,8 +26,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -38,18 +38,30 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
-from walop_jax.science import instrument_changes as alarms
-from walop_jax.science import places
+from walop_jax.science import star_columns as alarms
 from walop_jax.science import star_residuals as residuals
-from walop_jax.science.apply import residuals_of
+from walop_jax.science import star_search as places
+from walop_jax.science.apply import readings_in, residuals_of
 from walop_jax.science.catalogue import Catalogue
-from walop_jax.science.instrument_changes import UNNAMED, History, PossibleChange, profile, threshold
-from walop_jax.science.places import Seen, Strongest, fitted
+from walop_jax.science.star_columns import (
+    ALARM,
+    OF_SURVEYS,
+    RIVAL,
+    UNNAMED,
+    History,
+    PossibleChange,
+    Question,
+    Sum,
+    profile,
+    rivals_of,
+    threshold,
+)
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
-from walop_jax.science.watch_found import Watch, WatchedChange
-from walop_jax.science.watch_readings import Answers, Readings
+from walop_jax.science.star_search import Seen, StarSearch, Strongest, fitted, scored
+from walop_jax.science.star_words import FoundChange, Watch
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
+MISREAD_ROWS = 2048  # of catalogues of which it means nothing
 MOST_GROUPS = 150  # exposure groups that are separated; neighbours of more are joined
 EDGES = (2.0, 8.0)  # sharpness of spots: a blurred one and one with an edge
 _CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
@@ -70,11 +82,22 @@ def watch(
 
     Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
     an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
-    are looked at, spread over the stars. Raises `DataError` as `science.apply.apply` does, and where no row has a
-    camera to spare.
+    are looked at, spread over the stars. Each catalogue is first asked whether it is what it says (`readings_in`), with
+    all readings where the stars contradict the calibration as no change of it does. Raises `DataError` as
+    `science.apply.apply` does, and where no row has a camera to spare.
     """
-    catalogues, remarks = dated(catalogues, names)
     vectors = AnalysisVectors(with_rivals(calibration))
+    given, told = list(zip(named(names, len(catalogues)), catalogues, strict=True)), len(catalogues) > 1
+
+    def misread(*, doubted: bool = False) -> Iterator[str]:
+        for name, catalogue in given:
+            readings = readings_in(vectors, catalogue, force=force, doubted=doubted)
+            mended = (readings.words(),) if readings is not None and readings.mended else ()
+            yield from (f"{name}: {text}" if told else text for text in (*mended, *catalogue.doubts))
+
+    wrong = tuple(misread())
+    rows = min(rows, MISREAD_ROWS) if wrong else rows
+    catalogues, remarks = dated(catalogues, names)
     total, batches = sum(map(len, catalogues)), []
     for catalogue in catalogues:
         share = -(-rows * len(catalogue) // total)
@@ -83,7 +106,14 @@ def watch(
         raise DataError("N: no star has a camera to spare beside flux, q and u; add rows at other settings")
     stars = StarResiduals.joined(batches)
     result = Watching(stars, vectors).watch()
-    return dataclasses.replace(result, remarks=(*remarks, *result.remarks))
+    if result.doubtful and not wrong:
+        wrong = tuple(misread(doubted=True))
+    return dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
+
+
+def named(names: Sequence[str], count: int) -> list[str]:
+    """What messages call so many catalogues: their names, or numbers."""
+    return [names[n] if n < len(names) else f"catalogue {n + 1}" for n in range(count)]
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
@@ -95,7 +125,7 @@ def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[C
     remarks = []
     for number, timed in enumerate(has_time):
         if not timed.all():
-            name = names[number] if number < len(names) else f"catalogue {number + 1}"
+            name = named(names, number + 1)[number]
             rows = f"{np.sum(~timed) if timed.any() else 'all'} of {len(timed)} rows have no time"
             remarks.append(f"{name}, MJD: {rows}, others do: left out, as their times are unknown")
     timed_rows = zip(catalogues, has_time, strict=True)
@@ -134,10 +164,18 @@ def grouped(time: Float[np.ndarray, " r"], most: int = MOST_GROUPS) -> tuple[OfG
 OfGroups = Float[np.ndarray, " g"]
 Matrix = Float[np.ndarray, "c c"]
 Score = Float[np.ndarray, " c"]
-Settled = tuple[WatchedChange, Residuals]  # a change, and the residuals behind it
+Settled = tuple[FoundChange, Residuals]  # a change, and the residuals behind it
 
 
-class Watching:
+class Answers(NamedTuple):
+    """Of every history and question, each alone: size, standard error (inf: not seen), and direction of a gradient."""
+
+    size: Float[np.ndarray, "h c"]
+    error: Float[np.ndarray, "h c"]
+    angle: Float[np.ndarray, "h c"]
+
+
+class Watching(StarSearch):
     """The histories at the head of this file, looked for in the residuals of stars.
 
     `stars.time` is an MJD, or the number of the exposure group; rows of equal time are one group. `vectors` are those
@@ -145,10 +183,17 @@ class Watching:
     """
 
     def __init__(self, stars: StarResiduals, vectors: AnalysisVectors) -> None:
-        self.stars, self.cameras = stars, tuple(vectors.instrument.cameras.names)
-        self.readings = Readings(stars, vectors)
-        self.root = vectors.root[:, np.abs(vectors.root).max(axis=0, initial=0.0) > 0]
-        self.variance = residuals.own_variance(stars)
+        super().__init__(stars, vectors, OF_SURVEYS)
+        columns, every = self.columns, range(len(self.cameras))
+        # The last arm is no other than all before it: the sum of all is flux.
+        units = [*((k,) for k in every), *columns.arms[: len(vectors.instrument.cameras.arms) - 1]]
+        self.of_cameras = [columns.of_one("gain", unit) for unit in units]
+        self.members = np.array([[float(k in unit) for unit in units] for k in every])
+        gradients = []
+        for question, unit in zip(self.of_cameras, units, strict=True):
+            along, across = ({columns.number(kind, k): 1.0 for k in unit} for kind in ("x", "y"))
+            gradients.append(question._replace(kind="gradient", along=along, across=across))
+        self.questions: list[Question] = [*self.of_cameras, *gradients, *columns.optics]
         self.time, self.group = grouped(stars.time)
         groups = len(self.time)
         self.histories = [History("step", g) for g in range(groups)]
@@ -156,9 +201,9 @@ class Watching:
         self.histories += [History("once", g) for g in range(1, groups - 1)]
         self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
         self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
-        self.tests = len(self.histories) * self.readings.asked
+        self.tests = len(self.histories) * sum(question.number for question in self.questions)
         # Half of the false alarms are for spots: as many as there are would else take from all others.
-        self.alarm = threshold(0.5 * alarms.ALARM / self.tests)
+        self.alarm = threshold(0.5 * ALARM / self.tests)
         # Stars of a single group have a scale with the others of it; those of several groups together.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
@@ -185,7 +230,7 @@ class Watching:
     def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[Weights, Scale, bool]:
         """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
         chi2 = self.stars.chi2(residual) / self.variance
-        dof, alarm = self.stars.dof.astype(float), alarms.ALARM / (len(self.time) + 1)
+        dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > residuals.CROWDED else 0.0
         overall = residuals.beside_fitted(residuals.noise_scale(chi2, dof), dof, float(fitted.sum()))
         off = residuals.is_off(overall, alarm)
@@ -218,7 +263,7 @@ class Watching:
             fitted[g] = root.shape[1]
 
         def change(part: StarResiduals, rows: slice) -> Residuals:
-            return np.einsum("rkc,rc->rk", self.readings.columns(part)[..., :count], size[self.group[rows]])
+            return np.einsum("rkc,rc->rk", self.columns.of_cameras(part)[..., :count], size[self.group[rows]])
 
         return self.stars.behind(residual, change), fitted
 
@@ -226,7 +271,7 @@ class Watching:
 
     def scan(self, residual: Residuals, weights: Weights) -> tuple[Matrix, Score]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
-        stars, count, groups = self.stars, self.readings.columns_count, len(self.time)
+        stars, count, groups = self.stars, self.columns.count + len(self.columns.optics), len(self.time)
         nuisances = self.root.shape[1] + 2
         gains = np.zeros((groups * count, groups * count))
         cross, nuisance = np.zeros((groups * count, nuisances)), np.eye(nuisances)
@@ -234,7 +279,7 @@ class Watching:
         diagonal = np.zeros((groups, count))
         for numbers, rows, subset in stars.blocks():
             group, w, k = self.group[rows], weights.inverse[numbers], weights.share[numbers]
-            values = np.concatenate([self.readings.columns(subset), self._errors(subset)], axis=-1)
+            values = np.concatenate([self.columns.all_of(subset), self.errors(subset)], axis=-1)
             np.add.at(diagonal, group, np.sum(values[..., :count] ** 2, axis=1) * (w * k)[subset.star, None])
             free, along = subset.projected(values)
             heavy = np.sqrt(w * k)[subset.star]
@@ -298,9 +343,6 @@ class Watching:
         slopes = score.reshape(len(self.time), -1)
         return matrix.reshape(*slopes.shape, *slopes.shape), slopes
 
-    def _errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
-        return np.concatenate([part.parameters() @ self.root, part.colour], axis=-1)
-
     def suspects(self, found: Answers) -> list[PossibleChange]:
         """Readings with the best history of each kind and its neighbours, the strongest first, too large ones last."""
         strength = np.max(np.abs(found.size / found.error), axis=1)
@@ -310,20 +352,17 @@ class Watching:
                 top = max(mine, key=lambda n: strength[n])
                 compared += [n for n in (top - 1, top, top + 1) if n in mine]
         listed = []
-        for n, (k, reading) in itertools.product(compared, enumerate(self.readings.listed)):
-            size, error = float(found.size[n, k]), float(found.error[n, k])
-            place = () if reading.across is None else (float(found.angle[n, k]),)
-            since = reading.name, reading.kind != "optics", self.histories[n]
-            if np.isfinite(error):
-                listed.append(PossibleChange(*since, size, error, reading.unit, reading.kind, place))
-        return sorted(listed, key=lambda entry: (not self.readings.possible(entry), -abs(entry.sigma)))
+        for n, (k, question) in itertools.product(compared, enumerate(self.questions)):
+            entry = question.change(float(found.size[n, k]), float(found.error[n, k]))
+            place = () if question.across is None else (float(found.angle[n, k]),)
+            if np.isfinite(entry.error):
+                listed.append(entry._replace(history=self.histories[n], place=place))
+        return sorted(listed, key=lambda entry: (not entry.possible, -abs(entry.sigma)))
 
     def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
         """Residuals behind a change."""
         grown = change.history.over(self.time)[self.group, None] * size
-        return self.stars.behind(
-            residual, lambda part, rows: self.readings.signature(part, change) * grown[rows]
-        )
+        return self.stars.behind(residual, lambda part, rows: self.columns.of(part, change) * grown[rows])
 
     # --------------------------------------------------------------------------------------------- asking
 
@@ -350,7 +389,7 @@ class Watching:
         # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
-        largest = special.chdtri(dof, alarms.ALARM / len(dof))
+        largest = special.chdtri(dof, ALARM / len(dof))
         odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > largest)
         if not odd.any():
             return result
@@ -370,16 +409,44 @@ class Watching:
         scale = max(1.0, min(residuals.noise_scale(chi2, dof).value for chi2 in costs))
         cut = special.chdtri(np.maximum(dof, 1e-12), residuals.TRIMMED)
         cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in costs]
-        near = abs(cost[1] - cost[0]) < alarms.RIVAL and ways[1][0].best.kind != UNNAMED
+        near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
         # The simpler one, if both are as good: spots are the first.
         (change, remaining), (alternative, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
         if near:
             change = dataclasses.replace(change, alike=change.alike + alternative.alike)
         return change, remaining
 
-    def answers(self, matrix: Any, score: Any) -> Answers:
-        """Every history of every reading, each alone."""
-        return self.readings.answers(*self._by_group(matrix, score), self.shapes)
+    def answers(self, matrix: Matrix, score: Score) -> Answers:
+        """Every history of every question, each alone."""
+        (blocks, slopes), shapes = self._by_group(matrix, score), self.shapes
+        size = shapes.shape[1], len(self.questions)
+        answers = Answers(np.zeros(size), np.full(size, np.inf), np.zeros(size))
+
+        def information(one: Sum, across: Sum) -> Float[np.ndarray, " h"]:
+            terms = [v * w * blocks[:, a, :, b] for a, v in one.items() for b, w in across.items()]
+            return np.einsum("gh,gf,fh->h", shapes, np.sum(terms, axis=0), shapes, optimize=True)
+
+        def slope(of: Sum) -> Float[np.ndarray, " h"]:
+            return shapes.T @ np.sum([weight * slopes[:, a] for a, weight in of.items()], axis=0)
+
+        trace = np.einsum("gkgk->k", blocks)
+        for k, question in enumerate(self.questions):
+            info, pull = information(question.along, question.along), slope(question.along)
+            if question.across is not None:
+                across, mixed = (information(question.across, of) for of in (question.across, question.along))
+                turn = slope(question.across)
+                angle = np.arctan2(info * turn - mixed * pull, across * pull - mixed * turn)
+                cosine, sine = np.cos(angle), np.sin(angle)
+                info = cosine**2 * info + 2.0 * cosine * sine * mixed + sine**2 * across
+                pull = cosine * pull + sine * turn
+                answers.angle[:, k] = np.rad2deg(angle)
+            # Beyond rounding: `scan` has zeros where stars see nothing of a column.
+            informed = info > residuals.ROUNDING * sum(
+                trace[a] for a in (*question.along, *(question.across or {}))
+            )
+            answers.size[informed, k] = pull[informed] / info[informed]
+            answers.error[informed, k] = info[informed] ** -0.5
+        return answers
 
     def settled(self, residual: Residuals, answers: Answers) -> Settled:
         """A change with its rivals, and the residuals behind it.
@@ -394,11 +461,11 @@ class Watching:
                 weights, _ = self.weights(remaining)
                 answers = self.answers(*self.scan(self.without(remaining, best, -total), weights))
             ranked = self.suspects(answers)
-            if abs(ranked[0].sigma) < self.alarm or not self.readings.possible(ranked[0]):
+            if abs(ranked[0].sigma) < self.alarm or not ranked[0].possible:
                 ranked.sort(key=lambda entry: -abs(entry.sigma))
             before, best = best, ranked[0]
-            alike = alarms.rivals_of(best, ranked)
-            alike = [entry for entry in alike if self.readings.possible(entry)]
+            alike = rivals_of(best, ranked)
+            alike = [entry for entry in alike if entry.possible]
             moved = abs(best.size - total) / best.error
             total = best.size
             remaining = self.without(residual, best, total)
@@ -406,15 +473,15 @@ class Watching:
             if same and moved < _SETTLED:
                 break
         assert best is not None
-        if not self.readings.possible(best):
+        if not best.possible:
             best = best._replace(name=UNNAMED, unit="", kind=UNNAMED)
             alike = [best]
         return self._dated(best, alike), remaining
 
-    def _dated(self, best: PossibleChange, alike: list[PossibleChange]) -> WatchedChange:
+    def _dated(self, best: PossibleChange, alike: list[PossibleChange]) -> FoundChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
-        return WatchedChange(best, tuple(alike), *when)
+        return FoundChange(best, tuple(alike), *when)
 
     def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
@@ -428,13 +495,13 @@ class Watching:
         variance = 1.0 / np.where(usable, inverse, 1.0)
         found: list[tuple[Strongest, int, Seen]] = []  # that of all rows, and the strongest
         trials = 0
-        later = places.seen_from(self.stars, self.group, self.readings.members, residual, variance)
+        later = places.seen_from(self.stars, self.group, self.members, residual, variance)
         for start, seen in enumerate(every.of(usable) for every in later):
-            here = places.strongest(seen, self.readings.edge)
+            here = places.strongest(seen, self.columns.growth.edge)
             trials += here.trials
             if start == 0 or abs(here.sigma) > abs(found[-1][0].sigma):
                 found = [*found[:1], (here, start, seen)]
-        (spot, start, seen), alarm = found[-1], threshold(0.5 * alarms.ALARM / max(trials, 1))
+        (spot, start, seen), alarm = found[-1], threshold(0.5 * ALARM / max(trials, 1))
         if abs(spot.sigma) < alarm:
             return None
         near = seen.near(spot.place)
@@ -443,7 +510,7 @@ class Watching:
         ways = [fitted(near, spot.camera, start) for start in starts]
         gains = [places.share_of(near, spot.camera, profile(near.x, near.y, way)) for way in ways]
         (size, *_), place = max(zip(gains, ways, strict=True), key=lambda way: way[0][2])
-        name, since = self.readings.of_cameras[spot.camera].name, History("step", start)
+        name, since = self.of_cameras[spot.camera].name, History("step", start)
         ranked = [PossibleChange(name, True, since, kind="spot", place=place)]
         of_spot = np.zeros(len(usable), bool)
         for _, _, seen in found:
@@ -451,14 +518,14 @@ class Watching:
         weights = weights._replace(inverse=np.where(of_spot, inverse, weights.inverse))
         for _ in range(2):  # which cameras, and from when on
             best = ranked[0]
-            questions = [best._replace(name=reading.name) for reading in self.readings.of_cameras]
+            questions = [best._replace(name=question.name) for question in self.of_cameras]
             questions += [best._replace(history=History("step", g)) for g in range(len(self.time))]
             if not (ranked := self._sized(residual, questions, weights)):
                 return None
         best = ranked[0]
-        if abs(best.sigma) < alarm or not self.readings.possible(best):
+        if abs(best.sigma) < alarm or not best.possible:
             return None
-        alike = alarms.rivals_of(best, ranked)
+        alike = rivals_of(best, ranked)
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
@@ -468,20 +535,17 @@ class Watching:
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
             grown = (e.history.over(self.time)[self.group[rows], None] for e in asked)
-            steps = [g * self.readings.signature(part, e) for g, e in zip(grown, asked, strict=True)]
-            return np.concatenate([np.stack(steps, axis=-1), self._errors(part)], axis=-1)
+            steps = [g * self.columns.of(part, e) for g, e in zip(grown, asked, strict=True)]
+            return np.concatenate([np.stack(steps, axis=-1), self.errors(part)], axis=-1)
 
         matrix, score = residuals.normal_matrix(self.stars, residual, columns, weights)
-        count, diagonal = len(asked), np.diag(matrix)
-        matrix = matrix + np.diag((np.arange(len(matrix)) >= count).astype(float))
-        remaining, pull = residuals.eliminated(matrix, score, count)
-        information, sizes = np.diag(remaining), []
-        for entry, s, i, full in zip(asked, pull, information, diagonal, strict=False):
-            if i > residuals.ROUNDING * full > 0:
-                sizes.append(entry._replace(size=float(s / i), error=float(i**-0.5)))
-        return sorted(sizes, key=lambda entry: -abs(entry.sigma))
+        prior = (np.arange(len(matrix)) >= len(asked)).astype(float)
+        sized = scored(asked, matrix + np.diag(prior), score)
+        return sorted(
+            (entry for entry in sized if np.isfinite(entry.error)), key=lambda entry: -abs(entry.sigma)
+        )
 
-    def told(self, changes: list[WatchedChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
+    def told(self, changes: list[FoundChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
         """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
@@ -512,7 +576,7 @@ class Watching:
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=whole.value if residuals.is_off(whole, alarms.ALARM) else 1.0,
+            noise=whole.value if residuals.is_off(whole, ALARM) else 1.0,
             tests=self.tests,
             alarm=self.alarm,
         )

@@ -1,4 +1,4 @@
-"""Do the q and u of the stars themselves follow the instrument? They show what no sum of cameras does.
+"""What q and u of the stars themselves say: do they follow the instrument, or the sky? No sum of cameras shows that.
 
 A camera of an arm that has become brighter at the cost of the other leaves the sum of the arm as it was: the residuals
 of a row of four cameras (`star_residuals`) know nothing of it. But the raw q of every star is off then, and the
@@ -21,6 +21,15 @@ Error       the larger of two, each with its own Student t: by W; by the residua
             (Σ i)² / Σ i²
 Limits      A change whose shift of q and u is the same all over the field (B holds it) is not seen, as long as the
             instrument has no cross-talk that differs. Of fewer than `FEWEST` stars nothing is asked.
+
+Polarised light of the sky that is left in the counts is in no sum of cameras either, but grows as 1/flux:
+
+Equation    (q, u) of a star = m + c log₁₀ L + b S/L + own; L its light, S the sky under it (electron, all cameras)
+Symbols     b polarised light left over per unit of the sky's level, in the frame of (q, u); m, c what stars have in
+            common: interstellar polarisation grows with distance, hence with faintness, but never as 1/flux
+Method      as above, for q and u each; stars beyond `SKY_FAR` are left out
+Limits      a sky of one polarisation in the whole catalogue; first order in S/L. Sky left over without polarisation
+            lowers q and u by the same share of themselves, which nothing here shows.
 """
 
 from __future__ import annotations
@@ -28,16 +37,21 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import optimize, special
 
+from walop_jax.fit.verdict import Quality
 from walop_jax.io.shapes import OfStars
 from walop_jax.io.text import some, with_error
 from walop_jax.likelihood.inverses import whitening
-from walop_jax.science import instrument_changes as alarms
+from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.star_columns import ALARM, MOST_LIKELY, RIVAL, threshold
+
+if TYPE_CHECKING:
+    from walop_jax.science.apply import Stars
 
 FEWEST = 12  # stars, of which a sample is asked
 FLOOR = 0.002
@@ -60,13 +74,19 @@ _SLOPES = (1.5, 2.5, 3.5, 4.5)  # … and the exponents β of its variance that 
 _MOST_GROUPS = 20  # exposure groups with a mean of their own
 
 ResponseColumns = Float[np.ndarray, "s 2 c"]
+SKY_CHANCE = 1e-5  # probability that noise finds something in a sound catalogue
+SKY_FEWEST = 50  # stars
+SKY_MOST = 20_000  # that are looked at
+SKY_FAR = 5.0  # standard deviations
+_SKY_ROUNDS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class OwnLight:
     """q, u of stars, their noise, and what would move them: by `questions`, by errors of the calibration (`nuisances`).
 
-    `x`, `y` in degrees; `group` numbers exposure groups.
+    `x`, `y` in degrees; `group` numbers exposure groups. `cameras` are the shifts by a camera that is brighter by the
+    whole of its light: those of any change of its gain over the field are shares of them.
     """
 
     qu: Float[np.ndarray, "s 2"]
@@ -76,6 +96,11 @@ class OwnLight:
     group: Int[np.ndarray, " s"]
     questions: ResponseColumns
     nuisances: Float[np.ndarray, "s 2 n"]
+    cameras: Float[np.ndarray, "s 2 k"]
+
+    def without(self, shift: Float[np.ndarray, "s 2"]) -> OwnLight:
+        """The same stars where a change had not shifted their q and u so."""
+        return dataclasses.replace(self, qu=self.qu - shift)
 
     @classmethod
     def joined(cls, parts: list[OwnLight]) -> OwnLight:
@@ -101,7 +126,7 @@ class ArmChange(NamedTuple):
     @property
     def sigma(self) -> float:
         """The size in standard deviations of a normal number that is as improbable."""
-        return float(np.copysign(alarms.threshold(max(self.chance, 1e-300)), self.size))
+        return float(np.copysign(threshold(max(self.chance, 1e-300)), self.size))
 
     def words(self) -> str:
         """The change in words: which camera is brighter, by how much, and how sure that is."""
@@ -138,8 +163,8 @@ class OwnLightCheck:
     def smallest(self) -> float:
         """The change of the balance of the arm seen best that would be found in 99 % of such catalogues (nan: none)."""
         least = min((test.error for test in self.tests), default=np.inf)
-        alarm = alarms.ALARM / max(len(self.tests), 1)
-        return float((alarms.threshold(alarm) + alarms.MOST_LIKELY) * least) if np.isfinite(least) else np.nan
+        alarm = ALARM / max(len(self.tests), 1)
+        return float((threshold(alarm) + MOST_LIKELY) * least) if np.isfinite(least) else np.nan
 
     def words(self) -> str:
         """The finding in a sentence."""
@@ -162,12 +187,15 @@ class OwnLightCheck:
 class Unpolarised(NamedTuple):
     """(q, u) of stars by the linear step from q = u = 0, their `noise`, and their `shifts` by the balance of each arm.
 
+    `cameras` are their shifts by the whole light of each camera.
+
     Noise, weights and shifts do not depend on the q and u that are found: nor does a choice of stars by them.
     """
 
     qu: Float[np.ndarray, "s 2"]
     noise: Float[np.ndarray, "s 2 2"]
     shifts: ResponseColumns
+    cameras: Float[np.ndarray, "s 2 k"]
 
 
 def unpolarised(
@@ -205,9 +233,9 @@ def unpolarised(
     star = np.repeat(np.arange(len(first)), np.diff(first, append=len(counts)))
     gain = np.einsum("rij,rkj->rik", noise[star], pull)  # of (q, u), for counts
     qu = np.add.reduceat(np.einsum("rik,rk->ri", gain, data - expected), first)
-    lit = gain * expected[:, None]
-    shifts = np.stack([0.5 * (lit[..., i] - lit[..., j]) for i, j in arms], axis=-1)
-    return Unpolarised(qu, noise, np.add.reduceat(shifts, first))
+    cameras = np.add.reduceat(gain * expected[:, None], first)
+    shifts = np.stack([0.5 * (cameras[..., i] - cameras[..., j]) for i, j in arms], axis=-1)
+    return Unpolarised(qu, noise, shifts, cameras)
 
 
 def own_light_check(light: OwnLight, arms: Sequence[tuple[str, str]]) -> OwnLightCheck | None:
@@ -218,11 +246,11 @@ def own_light_check(light: OwnLight, arms: Sequence[tuple[str, str]]) -> OwnLigh
     if fitted is None:
         return None
     tests = tuple(_answer(fitted, question, ArmChange(arm)) for question, arm in enumerate(arms))
-    alarm = alarms.ALARM / len(tests)
+    alarm = ALARM / len(tests)
     best = max(tests, key=lambda test: abs(test.sigma))
     alike: list[ArmChange] = []
     if best.chance < alarm:
-        least = best.sigma**2 - alarms.RIVAL
+        least = best.sigma**2 - RIVAL
         alike = sorted((t for t in tests if t.sigma**2 > least), key=lambda t: -abs(t.sigma))
     return OwnLightCheck(int(fitted.used.sum()), float(np.sqrt(fitted.scatter)), tests, tuple(alike))
 
@@ -241,7 +269,7 @@ class _Fitted(NamedTuple):
 
 
 def _of_both(scalar: Float[np.ndarray, "s m"]) -> Float[np.ndarray, "s 2 n"]:
-    """Columns of q and of u, each with a scalar field."""
+    """ResponseColumns of q and of u, each with a scalar field."""
     both = np.zeros((len(scalar), 2, 2 * scalar.shape[1]))
     both[:, 0, ::2], both[:, 1, 1::2] = scalar, scalar
     return both
@@ -348,8 +376,8 @@ def _widths(
     return width, taken
 
 
-def _scatter(left: Float[np.ndarray, "s 2"], noise: Float[np.ndarray, "s 2 2"], dof: float) -> float:
-    """τ² for which χ² of residuals is their degrees of freedom."""
+def _scatter(left: Float[np.ndarray, "s m"], noise: Float[np.ndarray, "s m m"], dof: float) -> float:
+    """τ², beside the noise, for which χ² of residuals is their degrees of freedom."""
     widths, axes = np.linalg.eigh(noise)
     square = np.einsum("sji,sj->si", axes, left) ** 2
 
@@ -376,7 +404,7 @@ def _answer(fitted: _Fitted, question: int, change: ArmChange) -> ArmChange:
         return change
     spread = float(np.sqrt(np.sum(pull**2) * number / (number - 1.0)))
     errors = (information**-0.5, spread)
-    if max(errors) * (alarms.threshold(alarms.ALARM) + alarms.MOST_LIKELY) > LARGEST:
+    if max(errors) * (threshold(ALARM) + MOST_LIKELY) > LARGEST:
         return change
     chances = (_student(size / errors[0], fitted.dof), _student(size / max(spread, 1e-300), number - 1.0))
     return change._replace(size=size, error=max(errors), chance=max(chances))
@@ -385,3 +413,100 @@ def _answer(fitted: _Fitted, question: int, change: ArmChange) -> ArmChange:
 def _student(t: float, dof: float) -> float:
     """Probability of a number of Student's t as far from 0, to either side."""
     return float(2.0 * special.stdtr(dof, -abs(t)))
+
+
+# ------------------------------------------------------------------------------- light of the sky left over
+
+
+@dataclasses.dataclass(frozen=True)
+class LeftOverSky:
+    """Polarised light of the sky left over, `share` (q, u) of its level, with `errors`, from so many `stars`."""
+
+    share: Float[np.ndarray, " 2"]
+    errors: Float[np.ndarray, " 2"]
+    stars: int
+
+    @property
+    def p_value(self) -> float:
+        """Chance of a share as large without any."""
+        return float(np.exp(-0.5 * np.sum((self.share / self.errors) ** 2)))
+
+    @property
+    def found(self) -> bool:
+        """True if there is some."""
+        return self.p_value < SKY_CHANCE
+
+    @property
+    def bound(self) -> float:
+        """The share that is not exceeded with a probability of 99 %."""
+        return float(np.hypot(*self.share) + MOST_LIKELY * self.errors.max())
+
+    def covariance(self, ratio: OfStars) -> Float[np.ndarray, "s 2 2"]:
+        """Covariance of its shift of stars with a `ratio` of sky to light, 0 where none was found."""
+        of_share = np.outer(self.share, self.share) + np.diag(self.errors**2)
+        return np.where(self.found, ratio**2, 0.0)[:, None, None] * of_share
+
+    def words(self) -> str:
+        """The finding in a sentence."""
+        size = with_error(100 * float(np.hypot(*self.share)), 100 * float(self.errors.mean()))
+        angle = np.rad2deg(0.5 * np.arctan2(self.share[1], self.share[0])) % 180.0
+        return (
+            f"polarised light of the sky is left in the stars: {size} % of the level in SKY at {angle:.0f}°, as q and "
+            "u grow with SKY over N. Its shift is in the errors; subtract the sky anew"
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        document = {**dict(zip("qu", self.share.tolist(), strict=True)), "errors": self.errors.tolist()}
+        return document | {n: getattr(self, n) for n in ("p_value", "found", "bound", "stars")}
+
+
+def left_over_sky(
+    qu: Float[np.ndarray, "s 2"], photon: Float[np.ndarray, "s 2 2"], light: OfStars, ratio: OfStars
+) -> LeftOverSky | None:
+    """The sky left in stars of such light (electron) and sky over light; None of few stars, or of one ratio."""
+    good = np.isfinite(qu).all(axis=1) & np.isfinite(photon).all(axis=(1, 2))
+    chosen = np.flatnonzero(good & (light > 0) & np.isfinite(ratio) & (ratio >= 0))
+    chosen = chosen[np.mod(np.arange(len(chosen)) * 0.6180339887498949, 1.0) < SKY_MOST / max(len(chosen), 1)]
+    if len(chosen) < SKY_FEWEST or np.ptp(ratio[chosen]) <= 0:
+        return None
+    columns = np.stack([np.ones(len(chosen)), np.log10(light[chosen]), ratio[chosen]], axis=1)
+    columns[:, 1] -= columns[:, 1].mean()
+    slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
+    share, errors = np.array(slopes).T
+    measured = np.isfinite(slopes).all() and (errors > 0).all()
+    return LeftOverSky(share, errors, len(chosen)) if measured else None
+
+
+def _slope(columns: Float[np.ndarray, "s 3"], values: OfStars, variance: OfStars) -> tuple[float, float]:
+    """Coefficient of the last column, and its error."""
+    scatter, used = 0.0, np.ones(len(values), bool)
+    beta, inverse, residual = np.zeros(3), np.eye(3), values
+    for rounds_left in reversed(range(_SKY_ROUNDS + 1)):
+        weight = np.where(used, 1.0 / (variance + scatter), 0.0)
+        inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns), hermitian=True)
+        beta = inverse @ (columns.T @ (weight * values))
+        residual = values - columns @ beta
+        if rounds_left:
+            scatter = _scatter(residual[used, None], variance[used, None, None], float(used.sum()) - 3.0)
+            used = np.abs(residual) < SKY_FAR * np.sqrt(variance + scatter)
+    pull = np.where(used, residual / (variance + scatter), 0.0)[:, None] * columns
+    robust = inverse @ (pull.T @ pull) @ inverse
+    return float(beta[2]), float(np.sqrt(max(inverse[2, 2], robust[2, 2])))
+
+
+def with_sky(stars: Stars, catalogue: Catalogue) -> Stars:
+    """The stars with errors and bounds of the sky left in them, where the catalogue states its level."""
+    if catalogue.sky is None:
+        return stars
+    stated = np.isfinite(catalogue.counts) & np.isfinite(catalogue.sky)
+    sums = (np.where(stated, values, 0.0).sum(axis=1) for values in (catalogue.counts, catalogue.sky))
+    light, level = (np.bincount(catalogue.star, values) for values in sums)
+    ratio = np.where(light > 0, level / np.where(light > 0, light, 1.0), np.nan)
+    leftover = left_over_sky(stars.qu, stars.photon, light, ratio)
+    if leftover is None:
+        return stars
+    changed = stars.changed + np.nan_to_num(leftover.covariance(ratio))
+    flag = stars.flag | (Quality.CATALOGUE if leftover.found else 0)
+    check, bound = dataclasses.replace(stars.check, sky=leftover), leftover.bound * ratio
+    return dataclasses.replace(stars, changed=changed, flag=flag, check=check, sky_bound=bound)
