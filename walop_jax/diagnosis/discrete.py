@@ -66,6 +66,7 @@ from walop_jax.model.specification import Model
 
 _POINTS = 16  # field points that are looked at
 _STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
+_LOOKED = 8  # causes that take a step, of more those that the screen finds best
 _BEST = 3  # causes that are looked at again, and beside which a second one is sought
 _HELPS = 0.9  # of the misfit, that the first of two causes leaves at most by itself
 _EXCHANGED = 5  # worst exposures, of which two may have been exchanged
@@ -82,7 +83,7 @@ def silent(_: str) -> None:
 def refuse_mixups(result: FitResult) -> None:
     """Raise `DataError` with the remedy if another reading of its data explains the residuals of a fit."""
     if found := causes_of(result):
-        raise refusal(result, found)
+        raise refusal(result.chi2 / result.dof, found)
 
 
 def causes_of(
@@ -98,12 +99,10 @@ def causes_of(
     return causes(result.calset, result.model, left, structural, tell, descriptions=descriptions)
 
 
-def refusal(result: FitResult, found: Sequence[Alternative]) -> DataError:
-    """The error of data that other readings explain."""
+def refusal(left: float, found: Sequence[Alternative]) -> DataError:
+    """The error of data that other readings explain, and that leave `left` (χ²/dof) as they stand."""
     reasons = "; or if ".join(str(alternative) for alternative in found)
-    return DataError(
-        f"the model does not fit (χ²/dof = {result.chi2 / result.dof:.3g}); it would if {reasons}"
-    )
+    return DataError(f"the model does not fit (χ²/dof = {left:.3g}); it would if {reasons}")
 
 
 def causes(
@@ -121,18 +120,43 @@ def causes(
     """
     if left < thresholds.POOR_FIT:
         return ()
-    # The program that a small set was fitted with is there already.
-    few = calset if len(calset.points) <= FEW else thinned(calset, _POINTS, neighbours=1)
-    block = few.intensities.block(0, len(few.points))
-    lit = block.used[..., None] & (block.counts > 0)
-    if not lit.any():
+    few, likelihood = _few(calset, model)
+    if likelihood is None:
         return ()
-    # A mistake in all exposures misses all of the light by so much.
-    coarse = np.median(block.sigma[lit] / block.counts[lit]) * np.sqrt(left) >= thresholds.READING_COARSE
-    few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    likelihood = Likelihood.of(few, model)
     stands, values = _misfit(likelihood, left, _STEPS[1])
-    left = min(left, stands)
+    return _compared(likelihood, min(left, stands), values, structural, tell, descriptions=descriptions)
+
+
+def causes_before_a_fit(
+    calset: CalibrationSet, model: Model, structural: Sequence[Effect] = (), tell: Tell = silent
+) -> tuple[float, tuple[Alternative, ...] | None]:
+    """χ²/dof a few steps from the model as designed, and the causes of a gross misfit there; None: it is not gross.
+
+    A fit of data that are read wrongly wanders through all orders of the plates to no end: they are asked first.
+    """
+    few, likelihood = _few(calset, model)
+    if likelihood is None:
+        return np.nan, None
+    try:
+        left, values = _misfit(likelihood, FAR_OFF, _STEPS[1])
+    except np.linalg.LinAlgError:
+        return np.nan, None
+    if not FAR_OFF <= left < np.inf:
+        return left, None
+    return left, _compared(likelihood, left, values, structural, tell, descriptions=True)
+
+
+def _compared(
+    likelihood: Likelihood,
+    left: float,
+    values: Vector,
+    structural: Sequence[Effect],
+    tell: Tell,
+    *,
+    descriptions: bool,
+) -> tuple[Alternative, ...]:
+    """The causes that explain what a likelihood leaves at the `values` of a few steps, best first."""
+    few, model = likelihood.calset, likelihood.model
     if left < thresholds.POOR_FIT:  # the fit has lost its way, not the data
         return ()
     look = _Look(few, model, left, likelihood)
@@ -140,19 +164,10 @@ def causes(
         Alternative(effect.name, "add it to the model", effects=(effect,)) for effect in structural
     ]
     of_some = list(of_some_exposures(likelihood, _worst_exposures(likelihood, values)))
-    if not (coarse and left >= FAR_OFF):
+    if _most_missed(likelihood, values) < thresholds.READING_COARSE:
         return look.explaining(of_some, look.enough)
     tell("comparing discrete causes: plates, beams and cables, signs, zeros and units of the data")
     of_all = list(readings(few, model))
-    # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
-    sure = thresholds.READING_SURE
-    stages: list[tuple[Callable[[], Iterable[Alternative]], float]] = [
-        (lambda: look.screen.best(of_instrument), look.enough),
-        (lambda: of_some, look.enough),
-        (lambda: of_all, look.enough),
-        (lambda: look.screen.in_parts(of_all), sure),
-        (look.screen.steps, sure),
-    ]
     described = [
         Alternative(
             sentence,
@@ -162,20 +177,65 @@ def causes(
         for sentence in alternatives(model.template)
         if descriptions and OtherDescription.name not in model.effect_names
     ]
-    if described:
-        stages.append((lambda: look.screen.best(described), look.enough))
-    stages.append((lambda: instruments(few), look.enough))  # each costs a program of its own
+    # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
+    sure = thresholds.READING_SURE
+    stages: list[tuple[Callable[[], Iterable[Alternative]], float]] = [
+        (lambda: look.screen.best(of_instrument), look.enough),
+        (lambda: of_some, look.enough),
+        (lambda: of_all, look.enough),
+        (lambda: look.screen.in_parts(of_all), sure),
+    ]
+    far_off = left >= FAR_OFF
+    if far_off:  # nearer by, what has a size is for the search of names: there linear steps hold
+        stages.append((look.screen.steps, sure))
     near: list[Alternative] = []
     for stage, enough in stages:
         found = look.explaining(stage(), enough)
         if found and found[0].explained < sure:
             return found
         near += found  # another cause may explain all
-    tell("comparing two discrete causes at once")
-    if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
-        return found
+    if far_off:
+        tell("comparing two mistakes of the data at once")
+        if found := look.pairs([*of_some, *of_all]):
+            return found
+    # Each of these may cost a program of its own.
+    further = [lambda: look.screen.best(described)] if described else []
+    for last in (*further, *((lambda: instruments(few),) if far_off else ())):
+        found = look.explaining(last(), look.enough)
+        if found and found[0].explained < sure:
+            return found
+        near += found
+    if far_off:
+        tell("comparing two discrete causes at once")
+        if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
+            return found
     near.sort(key=_left)
     return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
+
+
+def _few(calset: CalibrationSet, model: Model) -> tuple[CalibrationSet, Likelihood | None]:
+    """A set at the few field points that are looked at, and its likelihood; None where no light was seen there."""
+    # The program that a small set was fitted with is there already.
+    few = calset if len(calset.points) <= FEW else thinned(calset, _POINTS, neighbours=1)
+    block = few.intensities.block(0, len(few.points))
+    if not (block.used[..., None] & (block.counts > 0)).any():
+        return few, None
+    few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
+    return few, Likelihood.of(few, model)
+
+
+def _most_missed(likelihood: Likelihood, values: Vector) -> float:
+    """Share of the light that is missed, rms of the exposure in which it is largest.
+
+    A mistake in the conditions of an exposure misses its light by per cents, and that of others hardly.
+    """
+    calset, used = likelihood.calset, likelihood.used
+    block = calset.intensities.block(0, len(calset.points))
+    _, residual = likelihood.residuals(values)
+    level = np.maximum(np.abs(block.counts), block.sigma).sum(axis=-1)
+    share = np.sqrt(np.mean((residual * block.sigma) ** 2, axis=-1)) * block.counts.shape[-1] / level
+    mean = np.where(used, share**2, 0.0).sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+    return float(np.sqrt(mean.max()))
 
 
 @dataclasses.dataclass
@@ -203,9 +263,11 @@ class _Look:
     ) -> tuple[Alternative, ...]:
         """Those of the causes that leave `enough` (χ²/dof) at most, best first; of equals the one listed first."""
         items = list(items)
-        tried = [_judged(item, self.calset, self.model, self.left, steps) for item in items]
+        likely = self.screen.best(items, _LOOKED) if len(items) > _LOOKED else items
+        tried = [_judged(item, self.calset, self.model, self.left, steps) for item in likely]
         self.tried += tried
         tried = sorted((item for item in tried if np.isfinite(item.explained)), key=_left)[:_BEST]
+        tried = [item for item in tried if item.explained <= thresholds.PART * tried[0].explained]
         best = [_judged(item, self.calset, self.model, item.explained, _STEPS[1]) for item in tried]
         good = sorted((item for item in best if item.explained < enough), key=_left)
         if not good:
@@ -232,7 +294,8 @@ class _Look:
                 screen = Screen(Likelihood.of(calset, model), first.explained)
             except (ValueError, np.linalg.LinAlgError):
                 continue
-            seconds = screen.best([item for item in items if item.what != first.what])
+            others = (item for item in items if item.what != first.what)
+            seconds = screen.best(others, share=1.0 / thresholds.PART)
             both = [first.beside(second) for second in seconds]
             if found := self.explaining(both, thresholds.READING_SURE, _STEPS[1]):
                 return found
@@ -310,16 +373,18 @@ class Screen:
         model = dataclasses.replace(self.likelihood.model, template=instrument)
         return Likelihood.of(item.change(self.calset), model), np.asarray(values_of(instrument))
 
-    def best(self, items: Iterable[Alternative]) -> list[Alternative]:
-        """The few causes that leave less than nothing changed does, and least, in their order."""
+    def best(
+        self, items: Iterable[Alternative], most: int = _BEST, share: float = 1.0
+    ) -> list[Alternative]:
+        """The `most` causes that leave less than a `share` of what nothing changed does, and least, in their order."""
         square, along = (part.sum(axis=0) for part in self.sums(self.stands))
         stands, ranked = float(self.left(square, along)), []
         for item in items:
             if (rows := self.changed(item)) is not None:
                 square, along = (part.sum(axis=0) for part in self.sums(rows))
-                if (left := float(self.left(square, along))) < stands:
+                if (left := float(self.left(square, along))) < share * stands:
                     ranked.append((left, item))
-        return _least(ranked)
+        return _least(ranked, most)
 
     def later(self) -> Bool[np.ndarray, "n e"]:
         """The exposures from the second on, from the third on, …, in the order of their times."""
@@ -412,9 +477,9 @@ class Screen:
         )
 
 
-def _least(ranked: Sequence[tuple[float, Alternative]]) -> list[Alternative]:
-    """The causes that leave least, the best first; not those that leave far more than the best."""
-    best = sorted(ranked, key=lambda pair: pair[0])[:_BEST]
+def _least(ranked: Sequence[tuple[float, Alternative]], most: int = _BEST) -> list[Alternative]:
+    """The `most` causes that leave least, the best first; not those that leave far more than the best."""
+    best = sorted(ranked, key=lambda pair: pair[0])[:most]
     return [item for left, item in best if left <= thresholds.PART * best[0][0]]
 
 
@@ -432,7 +497,7 @@ class _Stepping(NamedTuple):
 
 
 def _stepping(likelihood: Likelihood) -> Iterator[_Stepping]:
-    """The gain of every camera, as a factor on N less 1; the zero of the polariser (deg)."""
+    """The gain of every camera, as a factor on N less 1; the zero of every moving element (deg)."""
     names = likelihood.model.template.cameras.names
     for k, name in enumerate(names):
 
@@ -449,17 +514,20 @@ def _stepping(likelihood: Likelihood) -> Iterator[_Stepping]:
             1e-3,
             lambda first, second: (1.0 + first) * (1.0 + second) - 1.0,
         )
-    if likelihood.calset.exposures.clp_in.any():
+    for prefix, position in likelihood.calset.exposures.positions.items():
+        if not position.inside.any():
+            continue
 
-        def turned(calset: CalibrationSet, by: float, chosen: np.ndarray) -> CalibrationSet:
-            whole = with_part("exposures", lambda e: e.placed(**{POLARISER: Position.at(e.clp_angle + by)}))(
-                calset
-            )
+        def turned(calset: CalibrationSet, by: float, chosen: np.ndarray, prefix: str = prefix) -> CalibrationSet:
+            whole = with_part(
+                "exposures", lambda e: e.placed(**{prefix: Position.at(e.position(prefix).angle + by)})
+            )(calset)
             return in_some_exposures(calset, whole, chosen)
 
+        what = "the polariser" if prefix == POLARISER else f"the element of {prefix}"
         yield _Stepping(
-            lambda by: f"CLP_ANGLE is {abs(by):.3g}° too {'small' if by > 0 else 'large'}",
-            "check whether the polariser has slipped, and correct CLP_ANGLE",
+            lambda by, prefix=prefix: f"{prefix}_ANGLE is {abs(by):.3g}° too {'small' if by > 0 else 'large'}",
+            f"check whether {what} has slipped, and correct {prefix}_ANGLE",
             turned,
             0.01,
             lambda first, second: first + second,
