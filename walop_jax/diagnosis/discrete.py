@@ -73,6 +73,7 @@ _EXCHANGED = 5  # worst exposures, of which two may have been exchanged
 _ROUNDS = 3  # times that the size of a step is determined anew
 
 Tell = Callable[[str], None]
+Stage = Callable[[], Iterable[Alternative]]
 Rows = Float[np.ndarray, " d"]
 
 
@@ -178,38 +179,42 @@ def _compared(
         if descriptions and OtherDescription.name not in model.effect_names
     ]
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
-    sure = thresholds.READING_SURE
-    stages: list[tuple[Callable[[], Iterable[Alternative]], float]] = [
+    sure, far_off = thresholds.READING_SURE, left >= FAR_OFF
+    if not far_off:
+        # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
+        return look.first_of(
+            [lambda: of_some, lambda: of_all, lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
+        )
+    stages: list[tuple[Stage, float]] = [
         (lambda: look.screen.best(of_instrument), look.enough),
         (lambda: of_some, look.enough),
         (lambda: of_all, look.enough),
         (lambda: look.screen.in_parts(of_all), sure),
+        (look.screen.steps, sure),
     ]
-    far_off = left >= FAR_OFF
-    if far_off:  # nearer by, what has a size is for the search of names: there linear steps hold
-        stages.append((look.screen.steps, sure))
-    near: list[Alternative] = []
     for stage, enough in stages:
-        found = look.explaining(stage(), enough)
-        if found and found[0].explained < sure:
+        if found := look.first_of([stage], enough):
             return found
-        near += found  # another cause may explain all
-    if far_off:
-        tell("comparing two mistakes of the data at once")
-        if found := look.pairs([*of_some, *of_all]):
-            return found
+    tell("comparing two mistakes of the data at once")
+    if found := look.pairs([*of_some, *of_all]):
+        return found
     # Each of these may cost a program of its own.
-    further = [lambda: look.screen.best(described)] if described else []
-    for last in (*further, *((lambda: instruments(few),) if far_off else ())):
-        found = look.explaining(last(), look.enough)
-        if found and found[0].explained < sure:
-            return found
-        near += found
-    if far_off:
-        tell("comparing two discrete causes at once")
-        if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
-            return found
-    near.sort(key=_left)
+    described = [
+        Alternative(
+            sentence,
+            "correct the description of the instrument",
+            effects=(OtherDescription(change=sentence),),
+        )
+        for sentence in alternatives(model.template)
+        if descriptions and OtherDescription.name not in model.effect_names
+    ]
+    further: list[Stage] = [lambda: look.screen.best(described)] if described else []
+    if found := look.first_of([*further, lambda: instruments(few)], look.enough):
+        return found
+    tell("comparing two discrete causes at once")
+    if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
+        return found
+    near = sorted(look.near, key=_left)
     return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
 
 
@@ -240,13 +245,17 @@ def _most_missed(likelihood: Likelihood, values: Vector) -> float:
 
 @dataclasses.dataclass
 class _Look:
-    """Causes compared at some field points of a set; `tried` are all that took a step, with what each leaves."""
+    """Causes compared at some field points of a set; `tried` are all that took a step, with what each leaves.
+
+    `near` are those that explain what was asked of them, but leave more than noise.
+    """
 
     calset: CalibrationSet
     model: Model
     left: float
     likelihood: Likelihood
     tried: list[Alternative] = dataclasses.field(default_factory=list)
+    near: list[Alternative] = dataclasses.field(default_factory=list)
 
     @functools.cached_property
     def screen(self) -> Screen:
@@ -257,6 +266,15 @@ class _Look:
     def enough(self) -> float:
         """The χ²/dof below which a cause explains the data."""
         return min(1.0 + (self.left - 1.0) / thresholds.PART, FAR_OFF)
+
+    def first_of(self, stages: Iterable[Stage], enough: float) -> tuple[Alternative, ...]:
+        """The causes of the first stage that leave nothing but noise, best first; empty: none."""
+        for stage in stages:
+            found = self.explaining(stage(), enough)
+            if found and found[0].explained < thresholds.READING_SURE:
+                return found
+            self.near += found  # another cause may explain all
+        return ()
 
     def explaining(
         self, items: Iterable[Alternative], enough: float, steps: int = _STEPS[0]
@@ -326,6 +344,7 @@ class Screen:
         self.exposure = np.repeat(np.nonzero(self.used)[1], likelihood.cameras)
         self.basis = self.basis[:count]
         self.stands = self.rows(likelihood)
+        self._changed: dict[str, Rows | None] = {}
 
     @property
     def calset(self) -> CalibrationSet:
@@ -353,6 +372,11 @@ class Screen:
 
     def changed(self, item: Alternative) -> Rows | None:
         """Residuals with a cause; None where it cannot be asked."""
+        if item.what not in self._changed:
+            self._changed[item.what] = self._residuals_with(item)
+        return self._changed[item.what]
+
+    def _residuals_with(self, item: Alternative) -> Rows | None:
         try:
             if item.effects and not self.likelihood.model.effect_names:
                 rows = self.rows(*self._arranged(item))
@@ -428,14 +452,15 @@ class Screen:
         return _least(ranked)
 
     def steps(self) -> list[Alternative]:
-        """Numbers that may have stepped in the run, each from the exposure on from which that explains most."""
+        """Numbers whose step in the run explains most of the misfit, each from the exposure on from which it does."""
         found = []
+        square, along = (part.sum(axis=0) for part in self.sums(self.stands))
+        least = thresholds.GOOD_SHARE * float(self.left(square, along))
         for number in _stepping(self.likelihood):
             chosen, size, gain = self.step(number)
-            if gain > 0.0:
+            if gain > least:
                 found.append((gain, number, chosen, size))
-        best = sorted(found, key=lambda entry: -entry[0])[:_BEST]
-        likely = [entry for entry in best if entry[0] > thresholds.GOOD_SHARE * best[0][0]]
+        likely = sorted(found, key=lambda entry: -entry[0])[:_BEST]
         return [self._determined(number, chosen, size) for _, number, chosen, size in likely]
 
     def step(
