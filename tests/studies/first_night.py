@@ -113,7 +113,7 @@ def built(change: str, plan: ObservingPlan = WITH_PLATE) -> Made:
 
 
 def half(change: Change) -> Change:
-    """The mistake in the second half of the exposures of each KIND, in the order of time."""
+    """The mistake in the second half of the exposures: polariser, Moon and standards come in this order."""
 
     def changed(calset: CalibrationSet) -> CalibrationSet:
         return mixed(calset, change(calset), second_half(calset))
@@ -302,7 +302,7 @@ FORTY: dict[str, dict[str, Case]] = {
         "polariser backwards": Case(told(placed("CLP", np.negative)), BACKWARDS),
         "polariser angles halved": Case(told(placed("CLP", lambda a: a / 2.0)), "CLP_ANGLE.*half"),
         "polariser slips by 3 deg in mid-run": Case(
-            told(half(placed("CLP", lambda a: a + 3.0)), NO_PLATE), "turn of polariser|CLP_ANGLE"
+            told(half(placed("CLP", lambda a: a + 3.0))), "turn of polariser|CLP_ANGLE"
         ),
         "points shifted by 0.03 deg": Case(told(field(lambda x, y: (x + 0.03, y))), "X of all field points"),
         "U of SOURCES of the other sign": Case(told(stars(lambda q, u: (q, -u))), "^U of SOURCES"),
@@ -375,7 +375,7 @@ FURTHER: dict[str, Case] = {
     "beams exchanged, standards alone": Case(
         told(of_kind("standard", order(1, 0, 2, 3))), "E1, O1, O2, E2"
     ),
-    "polariser backwards, second half": Case(told(half(placed("CLP", np.negative)), NO_PLATE), BACKWARDS),
+    "polariser backwards, second half": Case(told(half(placed("CLP", np.negative))), BACKWARDS),
     "polariser + 45": Case(told(placed("CLP", lambda a: a + 45.0)), "CLP_ANGLE is 135"),
     "polariser + 90": Case(told(placed("CLP", lambda a: a + 90.0)), "CLP_ANGLE is 90"),
     "polariser in radians": Case(told(placed("CLP", np.deg2rad)), "CLP_ANGLE is in radians"),

@@ -29,8 +29,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -47,9 +48,11 @@ from walop_jax.diagnosis.readings import (
     listed,
     of_some_exposures,
     readings,
+    unchanged,
     with_block,
     with_part,
 )
+from walop_jax.diagnosis.stated_conditions import STEP, stated_numbers
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.model_of_set import model_like
 from walop_jax.fit.refit import FitResult, Vector
@@ -185,16 +188,13 @@ def _compared(
         return look.first_of(
             [lambda: of_some, lambda: of_all, lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
         )
-    stages: list[tuple[Stage, float]] = [
-        (lambda: look.screen.best(of_instrument), look.enough),
-        (lambda: of_some, look.enough),
-        (lambda: of_all, look.enough),
-        (lambda: look.screen.in_parts(of_all), sure),
-        (look.screen.steps, sure),
-    ]
-    for stage, enough in stages:
-        if found := look.first_of([stage], enough):
-            return found
+    whole: list[Stage] = [lambda: look.screen.best(of_instrument), lambda: of_some, lambda: of_all]
+    if found := look.first_of(whole, look.enough):
+        return found
+    if descriptions and (found := _stated_otherwise(likelihood, left, values)):
+        return found
+    if found := look.first_of([lambda: look.screen.in_parts(of_all), look.screen.steps], sure):
+        return found
     tell("comparing two mistakes of the data at once")
     if found := look.pairs([*of_some, *of_all]):
         return found
@@ -216,6 +216,32 @@ def _compared(
         return found
     near = sorted(look.near, key=_left)
     return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
+
+
+def _stated_otherwise(likelihood: Likelihood, left: float, values: Vector) -> tuple[Alternative, ...]:
+    """The number that the set states which leaves nothing but noise where it is another one; empty: there is none.
+
+    Its linear step must explain most of the misfit; then it is determined as a step in the run is.
+    """
+    screen = Screen(likelihood, left, values)
+    every, largest, best = np.ones(len(likelihood.calset.exposures), bool), 0.0, None
+    for stated in stated_numbers(likelihood.calset):
+
+        def changed(calset: CalibrationSet, by: float, _: Any, what: str = stated.what) -> CalibrationSet:
+            return next(one for one in stated_numbers(calset) if one.what == what).changed(by)
+
+        number = _Stepping(stated.changed_by, stated.remedy, changed, STEP * stated.width, operator.add)
+        _, size, gain = screen.step(number, every)
+        if gain > largest and abs(size) < stated.width:
+            largest, best = gain, (number, size)
+    if best is None or largest < thresholds.GOOD_SHARE * screen.misfit:
+        return ()
+    found = screen.determined(best[0], every, best[1], "")
+    found = _judged(found, likelihood.calset, likelihood.model, left, _STEPS[1])
+    if found.explained >= thresholds.READING_SURE:
+        return ()
+    number = f"{found.what} ({found.remedy}; χ²/dof = {found.explained:.3g})"
+    return (dataclasses.replace(found, number=number, change=unchanged),)
 
 
 def _few(calset: CalibrationSet, model: Model) -> tuple[CalibrationSet, Likelihood | None]:
@@ -370,6 +396,12 @@ class Screen:
         priors, pulled = self.of_priors
         return square + priors - np.sum((along + pulled) ** 2, axis=-1)
 
+    @functools.cached_property
+    def misfit(self) -> float:
+        """χ² of the set as it stands, less what the parameters could absorb."""
+        square, along = (part.sum(axis=0) for part in self.sums(self.stands))
+        return float(self.left(square, along))
+
     def changed(self, item: Alternative) -> Rows | None:
         """Residuals with a cause; None where it cannot be asked."""
         if item.what not in self._changed:
@@ -401,8 +433,7 @@ class Screen:
         self, items: Iterable[Alternative], most: int = _BEST, share: float = 1.0
     ) -> list[Alternative]:
         """The `most` causes that leave less than a `share` of what nothing changed does, and least, in their order."""
-        square, along = (part.sum(axis=0) for part in self.sums(self.stands))
-        stands, ranked = float(self.left(square, along)), []
+        stands, ranked = self.misfit, []
         for item in items:
             if (rows := self.changed(item)) is not None:
                 square, along = (part.sum(axis=0) for part in self.sums(rows))
@@ -454,14 +485,13 @@ class Screen:
     def steps(self) -> list[Alternative]:
         """Numbers whose step in the run explains most of the misfit, each from the exposure on from which it does."""
         found = []
-        square, along = (part.sum(axis=0) for part in self.sums(self.stands))
-        least = thresholds.GOOD_SHARE * float(self.left(square, along))
+        least = thresholds.GOOD_SHARE * self.misfit
         for number in _stepping(self.likelihood):
             chosen, size, gain = self.step(number)
             if gain > least:
                 found.append((gain, number, chosen, size))
         likely = sorted(found, key=lambda entry: -entry[0])[:_BEST]
-        return [self._determined(number, chosen, size) for _, number, chosen, size in likely]
+        return [self.determined(number, chosen, size) for _, number, chosen, size in likely]
 
     def step(
         self, number: _Stepping, chosen: Bool[np.ndarray, " e"] | None = None
@@ -487,16 +517,21 @@ class Screen:
         size = float(-scores[best] / information[best]) if alive[best] else 0.0
         return options[best] & (square > 0.0), size, float(gains[best])
 
-    def _determined(self, number: _Stepping, chosen: Bool[np.ndarray, " e"], size: float) -> Alternative:
-        """A step of a number, its size determined where the other parameters are fitted to it."""
+    def determined(
+        self, number: _Stepping, chosen: Bool[np.ndarray, " e"], size: float, where: str | None = None
+    ) -> Alternative:
+        """A step of a number, its size determined where the other parameters are fitted to it.
+
+        `where` names the exposures, in place of their numbers.
+        """
         for _ in range(_ROUNDS):
             likelihood = Likelihood.of(number.change(self.calset, size, chosen), self.likelihood.model)
             left, values = _misfit(likelihood, self.scale**2, _STEPS[1])
             _, more, _ = Screen(likelihood, left, values).step(number, chosen)
             size = number.joined(size, more)
-        where = listed(self.calset, chosen)
+        where = f" in {listed(self.calset, chosen)}" if where is None else where
         return Alternative(
-            f"{number.worded(size)} in {where}",
+            f"{number.worded(size)}{where}",
             number.remedy,
             lambda calset: number.change(calset, size, chosen),
         )
@@ -555,7 +590,7 @@ def _stepping(likelihood: Likelihood) -> Iterator[_Stepping]:
             f"check whether {what} has slipped, and correct {prefix}_ANGLE",
             turned,
             0.01,
-            lambda first, second: first + second,
+            operator.add,
         )
 
 

@@ -48,7 +48,8 @@ class Alternative:
     """A discrete cause: what must have happened, what to do about it, and the set rewritten, or the model extended.
 
     `effects` are what the instrument differs by (a structural effect, another description); `explained` is the χ²/dof
-    at the field points that were looked at.
+    at the field points that were looked at. `number` says which number of the set is wrong, where that is the cause:
+    a diagnosis of it is a verdict, not a refusal.
     """
 
     what: str
@@ -56,6 +57,7 @@ class Alternative:
     change: Change = unchanged
     effects: tuple[Effect, ...] = ()
     explained: float = np.inf
+    number: str = ""
 
     def __str__(self) -> str:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"

@@ -38,6 +38,7 @@ from walop_jax.diagnosis.remainder import (
     concluded,
     instead_of_a_search,
     rival_conditions,
+    wrong_number,
 )
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
@@ -98,8 +99,9 @@ def diagnose(
         raise refusal(left, causes)
     before = fit(Likelihood.of(sample, model))
     far_off = before.noise_scale > 1.0
-    if causes is None or not far_off:
+    if causes is None or not (far_off or any(cause.number for cause in causes)):
         causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
+    number = causes[0].number if causes else ""
     left = before.chi2 / max(before.dof, 1)
     if causes and causes[0].of_data and (far_off or causes[0].explained < thresholds.READING_SURE):
         raise refusal(left, causes)
@@ -113,8 +115,11 @@ def diagnose(
     )
     tell(Stage("scoring every effect and pattern", "scoring"))
     first = State(judge.examined(before))
-    conditions = condition_scores(first.evidence.design) if far_off else Singles()
-    remainder = instead_of_a_search(first, conditions) if not causes else None
+    conditions = condition_scores(first.evidence.design) if far_off and not number else Singles()
+    if number:
+        remainder = wrong_number(first, number)
+    else:
+        remainder = instead_of_a_search(first, conditions) if not causes else None
     if remainder is None:
         begun = judge.with_causes(first, causes[0].effects if causes else ())
         state, remainder = concluded(first, search(begun, judge), judge)
@@ -122,7 +127,7 @@ def diagnose(
         state = first
     explained = state.evidence.result
     # Another reading that comes near competes with names and with other descriptions of the instrument.
-    if remainder and causes and causes[0].explained * explained.dof < explained.chi2:
+    if remainder and causes and not number and causes[0].explained * explained.dof < explained.chi2:
         raise refusal(left, causes)
     if not conditions.items and (state.steps or remainder):
         conditions = condition_scores(first.evidence.design)
