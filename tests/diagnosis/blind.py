@@ -22,6 +22,7 @@ import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, se
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit
+from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.likelihood import Likelihood
@@ -191,10 +192,16 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
             yield name, np.sum([said[text] for text in texts], axis=0)
 
 
+def with_all_names(result: FitResult, hypotheses: Hypotheses, rng: np.random.Generator) -> Examination:
+    """The examination in which synonyms are candidates of their own: each is hidden, and asked for, by its own name."""
+    nothing = SimpleNamespace(also={}, is_like=lambda design: False)
+    return examine(result, hypotheses, rng, nothing)  # type: ignore[arg-type]
+
+
 class Blind:
     """A design made ready for drawing and judging scenes."""
 
-    def __init__(self, calset: CalibrationSet, seed: int = 1, examined: Examined = examine) -> None:
+    def __init__(self, calset: CalibrationSet, seed: int = 1, examined: Examined = with_all_names) -> None:
         model = base_model(calset)
         result = fit(Likelihood.of(calset, model))
         self.rng = np.random.default_rng(seed)
