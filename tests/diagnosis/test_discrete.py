@@ -12,11 +12,12 @@ from small_run import SEED, SMALL, WITH_PLATE
 
 from walop_jax.data.records import CalibrationSet, FilterCurve, Position
 from walop_jax.diagnosis import search, workflow
-from walop_jax.diagnosis.discrete import _most_missed, _stepping, causes, causes_before_a_fit
+from walop_jax.diagnosis.discrete import _most_missed, causes, causes_before_a_fit
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import FitComparison
 from walop_jax.diagnosis.readings import Alternative, _columns_exchanged, _filters, in_some_exposures
+from walop_jax.diagnosis.screen import stepping
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult
@@ -239,7 +240,7 @@ def test_the_zero_of_every_moving_element_may_have_stepped():
     """5° on the plate in two exposures, of those where it is in the beam."""
     calset = simulate(WITH_PLATE, seed=SEED).calset
     likelihood = Likelihood.of(calset, base_model(calset))
-    told = {number.worded(5.0): number for number in _stepping(likelihood)}
+    told = {number.worded(5.0): number for number in stepping(likelihood)}
     number = told["CHWP_ANGLE is 5° too small"]
     assert "CLP_ANGLE is 5° too small" in told
     at = calset.exposures.position("CHWP")

@@ -31,7 +31,7 @@ from changed_sets import block_of, with_block  # noqa: E402
 
 from walop_jax.data.records import CalibrationSet, FilterCurve, Position  # noqa: E402
 from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
-from walop_jax.fit.base_model import base_model
+from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
 from walop_jax.model.compiled import switch_on  # noqa: E402
 from walop_jax.model.effects import OtherDescription, effect_by_name  # noqa: E402
@@ -267,7 +267,8 @@ def site(name: str, turn: Callable[[float], float]) -> Change:
 def angles_exchanged(one: str, other: str) -> Change:
     """Columns of two moving elements exchanged."""
     return lambda c: dataclasses.replace(
-        c, exposures=c.exposures.placed(**{one: c.exposures.position(other), other: c.exposures.position(one)})
+        c,
+        exposures=c.exposures.placed(**{one: c.exposures.position(other), other: c.exposures.position(one)}),
     )
 
 
@@ -282,7 +283,9 @@ def bins_reversed(calset: CalibrationSet) -> CalibrationSet:
 PLATE = "chwp.in.beam|chwp in the beam|CHWP was in the beam"
 BACKWARDS = "CLP_ANGLE runs the other way"
 MIRRORED = "(HWP|DEROT)_ANGLE runs the other way"  # of light that is polarised along an axis, mirror images
-OPPOSITE = "order right, left|exchanged beams|HWP_ANGLE is (45|135)|DEROT_ANGLE is 90"  # q and u of the other sign
+OPPOSITE = (
+    "order right, left|exchanged beams|HWP_ANGLE is (45|135)|DEROT_ANGLE is 90"  # q and u of the other sign
+)
 
 
 def in_either_order(first: str, second: str) -> str:
@@ -348,9 +351,13 @@ FORTY: dict[str, dict[str, Case]] = {
         "beams exchanged": Case(told(order(1, 0), BENCH), OPPOSITE),
         "plate backwards": Case(told(placed("HWP", np.negative), BENCH), MIRRORED),
         "derotator backwards": Case(told(placed("DEROT", np.negative), BENCH), MIRRORED),
-        "angles of plate and derotator exchanged": Case(told(angles_exchanged("HWP", "DEROT"), BENCH), "HWP.*DEROT.*exchanged"),
+        "angles of plate and derotator exchanged": Case(
+            told(angles_exchanged("HWP", "DEROT"), BENCH), "HWP.*DEROT.*exchanged"
+        ),
         "derotator angles doubled": Case(told(placed("DEROT", lambda a: 2.0 * a), BENCH), "DEROT_ANGLE is twice"),
-        "plate slips by 5 deg in mid-run": Case(told(half(placed("HWP", lambda a: a + 5.0)), BENCH), "HWP_ANGLE|turn of"),
+        "plate slips by 5 deg in mid-run": Case(
+            told(half(placed("HWP", lambda a: a + 5.0)), BENCH), "HWP_ANGLE|turn of"
+        ),
         "bins counted from the other end": Case(told(bins_reversed, BENCH), "FILTER|filters"),
         "beams exchanged; derotator backwards": Case(
             told(both(order(1, 0), placed("DEROT", np.negative)), BENCH), in_either_order(OPPOSITE, MIRRORED)

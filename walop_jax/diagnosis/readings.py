@@ -391,9 +391,7 @@ def _columns_exchanged(calset: CalibrationSet) -> Iterator[Alternative]:
             f"exchange {one}_IN and {other}_IN, {one}_ANGLE and {other}_ANGLE",
             with_part(
                 "exposures",
-                lambda e, one=one, other=other: e.placed(
-                    **{one: e.position(other), other: e.position(one)}
-                ),
+                lambda e, one=one, other=other: e.placed(**{one: e.position(other), other: e.position(one)}),
             ),
         )
 
@@ -401,7 +399,9 @@ def _columns_exchanged(calset: CalibrationSet) -> Iterator[Alternative]:
 def _filters(calset: CalibrationSet) -> Iterator[Alternative]:
     """Names of two filters exchanged; bins of a spectrum counted from the other end."""
     curves = calset.filters
-    names = sorted(curves, key=lambda name: float(np.average(curves[name].wavelength, weights=curves[name].throughput)))
+    names = sorted(
+        curves, key=lambda name: float(np.average(curves[name].wavelength, weights=curves[name].throughput))
+    )
     for one, other in itertools.combinations(names, 2) if len(names) <= _FEW_FILTERS else ():
         yield Alternative(
             f"the filters {one} and {other} were exchanged",
