@@ -1,0 +1,323 @@
+"""What is missing, and which candidate it is: the most probable set of things, by exact evidence of linear steps.
+
+A rival of the search that `diagnose` makes, which `one_law.py` compares with it.
+
+One fit leaves residuals. A *thing* is one cause of what they show; a *candidate* is one way to say it: a shape of an
+effect of the catalogue, a description, a part of an effect, a pattern without a name. "A ghost, and a camera that is
+not linear" are two things; for the first of them "ghost" and four descriptions of added light may be candidates.
+
+Prior        One thing more is missing with probability 1 − ν. It is of one of K kinds, equally probable: each effect
+             is a kind, all descriptions together are one, all parts, all patterns; the candidates of a kind share its
+             probability π. Amplitudes are N(0, t²w²) with prior widths w and scales t (`score.SCALES`), all equally
+             probable; t = 1 for a single amplitude. Of an amplitude that physics keeps above 0 the prior is the half of
+             that normal distribution, twice as dense.
+Evidence     Of a set M of candidates with columns A behind the free parameters, G = AᵀA and s = Aᵀr in units of the
+             scatter behind all candidates, T = t²w²:
+
+                 ln B(M) = ½ sᵀT^½ (1 + T^½GT^½)⁻¹ T^½s − ½ ln det(1 + T^½GT^½)
+
+             Every other candidate is scored beside M by the same formula, with G and s less what M takes up. The
+             posterior of M is proportional to B(M) Π π (1 − ν)/ν.
+Search       The most probable candidate is added until nothing more is missing with a probability above 1 − λ. After
+             each addition every member is taken out in turn, and the most probable candidate beside the others takes
+             its place, until nothing changes; a member that is less probable than its absence goes.
+Who it is    The *set* of a thing, given the other things, is the shortest list of names that holds it with probability
+             λ, by either of two priors: the one above, in which one description has a thousandth of the probability of
+             a name, since there are thousands of them; and one in which all names and all descriptions are equally
+             probable. Whether something is missing depends on the price of trials; which candidate it is need not.
+Limits       Linear steps from one fit: right where the residuals of the fit are small, or where all columns are linear.
+             A posterior over a list knows nothing of what is not in the list.
+Sources      Dickey 1971, Ann. Math. Stat. 42, 204 (evidence of nested models); Liang et al. 2008, JASA 103, 410
+             (mixtures of priors); Mitchell & Beauchamp 1988, JASA 83, 1023 (spike and slab); the set of one thing given
+             the others: Wang et al. 2020, JRSS B 82, 1273 (credible sets of SuSiE, whose sum of single effects is
+             replaced by exact evidence with exchange).
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import special
+
+from walop_jax.diagnosis import thresholds
+from walop_jax.diagnosis.examination import Evidence
+from walop_jax.diagnosis.hypotheses import Probe
+from walop_jax.diagnosis.score import SCALES, Vector
+from walop_jax.model.effects import Described
+
+NOTHING_MORE = 0.5  # ν, probability beforehand that nothing more is missing
+# λ, probability that something is missing from which on it is called, and with which a set of names holds its thing.
+CERTAIN = 0.95
+MOST_THINGS = 6  # of one set
+MOST_EXCHANGES = 10  # rounds of exchanges after one addition
+
+Member = tuple[int, float]
+"""A candidate by its position, and the scale t of the prior of its amplitudes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Thing:
+    """One missing cause: its most probable candidate, and all names that it may have, given the other things.
+
+    `candidate` is the probe, or the name of the pattern, with the largest posterior probability; `log_evidence` is its
+    ln B beside the other things, in units of the scatter behind all candidates. `probabilities` are those of all names
+    of effects and of all descriptions, the most probable first; `equal` the same, were all of them equally probable
+    beforehand. `shapes` are the probes that each name of the set may mean, down to the `CERTAIN` part of its
+    probability.
+    """
+
+    candidate: Probe | str
+    log_evidence: float
+    probabilities: Mapping[str, float]
+    equal: Mapping[str, float]
+    shapes: Mapping[str, tuple[Probe, ...]]
+
+    @property
+    def is_pattern(self) -> bool:
+        """True if a pattern without a name is more probable than every name and every description."""
+        return isinstance(self.candidate, str)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The set of the thing: names that hold it with the probability `CERTAIN`, by either prior."""
+        return tuple(dict.fromkeys([*_shortest(self.probabilities), *_shortest(self.equal)]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """The most probable set of things for one fit, and the probability that nothing more is missing beside them."""
+
+    things: tuple[Thing, ...]
+    nothing_more: float
+
+    @property
+    def explains(self) -> bool:
+        """True if names say what is there: nothing more is missing, no pattern is needed, and few things are nameless.
+
+        More than `thresholds.MOST_SENTENCES` descriptions can be one thing that none of them holds.
+        """
+        nameless = [t for t in self.things if isinstance(t.candidate, Probe) and _is_nameless(t.candidate)]
+        patterns = any(thing.is_pattern for thing in self.things)
+        few = len(nameless) <= thresholds.MOST_SENTENCES
+        return self.nothing_more > 1.0 - CERTAIN and not patterns and few
+
+
+def most_probable(evidence: Evidence) -> Posterior:
+    """The most probable set of things that are missing in a fit."""
+    return Candidates(evidence).posterior()
+
+
+class Candidates:
+    """All candidates of one fit, ready to be scored beside any few of them.
+
+    Columns are in prior widths, and residuals in units of the scatter behind all candidates. Amplitudes that these data
+    cannot show (`ScoreSpace.alive`) are 0.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        space = evidence.space
+        self.names = space.names
+        self.probes: dict[str, Probe] = {probe.name: probe for probe in evidence.asked}
+        self._gram, self._noise = space.gram, evidence.table.noise_scale
+        self.widths = np.where(space.alive, space.widths, 0.0)
+        self.scores = np.asarray(evidence.scores) * self.widths / self._noise**2
+        sizes = np.array(space.sizes)
+        self._places = list(space.places().values())
+        self.one_sided = np.zeros(len(self.widths), bool)
+        kinds = collections.defaultdict[str, list[int]](list)
+        for number, name in enumerate(self.names):
+            probe = self.probes.get(name)
+            if probe is not None:
+                self.one_sided[self._places[number]] = probe.one_sided
+            kinds[_kind(probe)].append(number)
+        self.log_prior = np.full(len(self.names), -np.inf)
+        for members in kinds.values():
+            self.log_prior[members] = -np.log(len(kinds)) - np.log(len(members))
+        self._blocks = [
+            (chosen, *self._block(chosen, int(size)))
+            for size in np.unique(sizes)
+            if len(chosen := np.flatnonzero((sizes == size) & np.isfinite(self.log_prior)))
+        ]
+        self.scales_of = np.where(sizes > 1, len(SCALES), 1)
+
+    def _block(
+        self, chosen: Int[np.ndarray, " n"], size: int
+    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n k k"]]:
+        """Positions of the amplitudes of candidates of one size, and products of the columns of each."""
+        at = np.array([self._places[number].start for number in chosen])[:, None] + np.arange(size)
+        gram = np.stack([self._gram[place, place] for place in map(self._places.__getitem__, chosen)])
+        return at, gram * self.widths[at][:, :, None] * self.widths[at][:, None, :] / self._noise**2
+
+    # --------------------------------------------------------------------------------------------- evidence
+
+    def beside(self, members: Sequence[Member]) -> Float[np.ndarray, "n t"]:
+        """ln B of every candidate at each scale beside some members; −∞ where it is not asked."""
+        along, taken = self._taken_up(members)
+        scores = self.scores - along @ taken
+        found = np.full((len(self.names), len(SCALES)), -np.inf)
+        for chosen, at, gram in self._blocks:
+            left = gram - np.einsum("nim,njm->nij", along[at], along[at])
+            if at.shape[1] == 1:
+                value, vector = left[:, :, 0], np.ones_like(left)
+            else:
+                value, vector = np.linalg.eigh(left)
+            value = np.clip(value, 0.0, None)
+            turned = np.einsum("nij,ni->nj", vector, scores[at])
+            for number, scale in enumerate(SCALES[: 1 if at.shape[1] == 1 else None]):
+                spread = scale**2 / (1.0 + scale**2 * value)
+                bayes = 0.5 * np.sum(spread * turned**2 - np.log1p(scale**2 * value), axis=1)
+                bayes += self._on_its_side(self.one_sided[at], vector, spread, turned)
+                found[chosen, number] = bayes
+        return found
+
+    def _taken_up(self, members: Sequence[Member]) -> tuple[Float[np.ndarray, "a m"], Vector]:
+        """What members take up of all columns, and of the scores."""
+        if not members:
+            return np.zeros((len(self.widths), 0)), np.zeros(0)
+        places = [self._places[number] for number, _ in members]
+        at = np.concatenate([np.arange(place.start, place.stop) for place in places])
+        scale = np.concatenate(
+            [np.full(p.stop - p.start, t) for p, (_, t) in zip(places, members, strict=True)]
+        )
+        products = self._gram[:, at] * (self.widths[:, None] * scale * self.widths[at] / self._noise**2)
+        root = np.linalg.cholesky(products[at] * scale[:, None] + np.eye(len(at)))
+        return np.linalg.solve(root, products.T).T, np.linalg.solve(root, scale * self.scores[at])
+
+    @staticmethod
+    def _on_its_side(
+        one_sided: Bool[np.ndarray, "n k"],
+        vector: Float[np.ndarray, "n k k"],
+        spread: Float[np.ndarray, "n k"],
+        turned: Float[np.ndarray, "n k"],
+    ) -> Vector:
+        """ln of the probability that one-sided amplitudes are above 0, by data and prior against the prior alone.
+
+        Exact for one amplitude; of several each is taken by itself.
+        """
+        if not one_sided.any():
+            return np.zeros(len(one_sided))
+        mean = -np.einsum("nij,nj->ni", vector, spread * turned)
+        sigma = np.sqrt(np.einsum("nij,nj->ni", vector**2, spread))
+        return np.sum(np.where(one_sided, np.log(2.0) + special.log_ndtr(mean / sigma), 0.0), axis=1)
+
+    def over_scales(self, found: Float[np.ndarray, "n t"]) -> Vector:
+        """ln B of every candidate, averaged over the scales."""
+        return np.logaddexp.reduce(found, axis=1) - np.log(self.scales_of)
+
+    # ------------------------------------------------------------------------------------------- the search
+
+    def posterior(self) -> Posterior:
+        """The most probable set of things, one added after the other, with exchanges."""
+        members, odds = (
+            list[Member](),
+            float(np.log(1.0 - NOTHING_MORE) - np.log(NOTHING_MORE)),
+        )
+        while True:
+            best, total = self._best(members)
+            nothing_more = float(special.expit(-(total + odds)))
+            if nothing_more > 1.0 - CERTAIN or len(members) == MOST_THINGS:
+                break
+            members = self._exchanged([*members, best], odds)
+        return Posterior(tuple(self._things(members)), nothing_more)
+
+    def _probable(self, members: Sequence[Member]) -> tuple[Vector, Float[np.ndarray, "n t"]]:
+        """ln of B π of every candidate beside some members, and its evidence by scale."""
+        found = self.beside(members)
+        worth = self.over_scales(found) + self.log_prior
+        worth[[number for number, _ in members]] = -np.inf
+        return worth, found
+
+    def _best(self, members: Sequence[Member]) -> tuple[Member, float]:
+        """The most probable candidate beside some members, and ln of the sum of B π over all."""
+        worth, found = self._probable(members)
+        number = int(np.argmax(worth))
+        return (number, float(SCALES[np.argmax(found[number])])), float(np.logaddexp.reduce(worth))
+
+    def _exchanged(self, members: list[Member], odds: float) -> list[Member]:
+        """The members, each replaced by the most probable candidate beside the others, until nothing changes."""
+        for _ in range(MOST_EXCHANGES):
+            before = list(members)
+            for member in before:
+                others = [one for one in members if one != member]
+                worth, found = self._probable(others)
+                number = int(np.argmax(worth))
+                if worth[number] + odds < 0.0:
+                    members = others
+                else:
+                    scale = float(SCALES[np.argmax(found[number])])
+                    members = [(number, scale) if one == member else one for one in members]
+            if members == before or len(members) < 2:
+                break
+        return members
+
+    def _things(self, members: Sequence[Member]) -> Iterator[Thing]:
+        """The things of a set, each with its names."""
+        for member in members:
+            others = [one for one in members if one != member]
+            bayes = self.over_scales(self.beside(others))
+            bayes[[number for number, _ in others]] = -np.inf
+            number = int(np.argmax(bayes + self.log_prior))
+            name = self.names[number]
+            yield Thing(self.probes.get(name, name), float(bayes[number]), *self._named(bayes))
+
+    def _named(
+        self, bayes: Vector
+    ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[Probe, ...]]]:
+        """Probabilities of all names, by their prior and equally probable beforehand; shapes of those of the set."""
+        worth = bayes + self.log_prior
+        of_name = collections.defaultdict[str, list[int]](list)
+        for number, name in enumerate(self.names):
+            for called in _called(self.probes[name]) if name in self.probes else ():
+                of_name[called].append(number)
+        by_prior = _normalised({called: _log_sum(worth[of]) for called, of in of_name.items()})
+        equal = _normalised({called: _log_sum(bayes[of]) - np.log(len(of)) for called, of in of_name.items()})
+        shapes = {
+            called: tuple(
+                self.probes[name]
+                for name in _shortest(_normalised({self.names[k]: float(bayes[k]) for k in of_name[called]}))
+            )
+            for called in {*_shortest(by_prior), *_shortest(equal)}
+        }
+        return by_prior, equal, shapes
+
+
+def _log_sum(logs: Iterable[float]) -> float:
+    return float(np.logaddexp.reduce([*logs, -np.inf]))
+
+
+def _normalised(logs: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities, the largest first, from their logarithms but for a constant."""
+    whole = _log_sum(logs.values())
+    return {
+        name: float(np.exp(logs[name] - whole)) for name in sorted(logs, key=logs.__getitem__, reverse=True)
+    }
+
+
+def _shortest(probabilities: Mapping[str, float]) -> tuple[str, ...]:
+    """The shortest list that holds `CERTAIN`; the most probable come first already."""
+    held = np.cumsum(list(probabilities.values()))
+    return tuple(probabilities)[: int(np.searchsorted(held, CERTAIN)) + 1]
+
+
+def _is_nameless(probe: Probe) -> bool:
+    return probe.effect is Described and not probe.holders
+
+
+def _called(probe: Probe) -> tuple[str, ...]:
+    """Names of a candidate: its effect, its descriptions, or the effects of which it is a part."""
+    if probe.effect is not Described:
+        return (probe.effect.name,)
+    return tuple(sorted(effect.name for effect in probe.holders)) or (probe.name,)
+
+
+def _kind(probe: Probe | None) -> str:
+    """The kind of things that a candidate is of; None is a pattern."""
+    if probe is None:
+        return "a pattern"
+    if probe.effect is not Described:
+        return f"the effect {probe.effect.name}"
+    return "a description" if _is_nameless(probe) else "a part of an effect"
