@@ -406,7 +406,7 @@ FURTHER: dict[str, Case] = {
         told(both(order(0, 2, 1, 3), column("rotator", np.negative))), "O1, O2, E1, E2.*ROTATOR|ROTATOR.*O1, O2, E1, E2"
     ),
 }  # fmt: skip
-"""Others of South, on which no rule was looked at before it stood."""
+"""Others of South, of the list before."""
 
 
 class Told(NamedTuple):
