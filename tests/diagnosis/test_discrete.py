@@ -8,18 +8,21 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from changed_sets import block_of, with_block
-from small_run import SEED, SMALL
+from small_run import SEED, SMALL, WITH_PLATE
 
-from walop_jax.data.records import CalibrationSet, Position
-from walop_jax.diagnosis import search
-from walop_jax.diagnosis.discrete import causes
+from walop_jax.data.records import CalibrationSet, FilterCurve, Position
+from walop_jax.diagnosis import search, workflow
+from walop_jax.diagnosis.discrete import _most_missed, causes, causes_before_a_fit
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import FitComparison
-from walop_jax.diagnosis.readings import Alternative, in_some_exposures
+from walop_jax.diagnosis.readings import Alternative, _columns_exchanged, _filters, in_some_exposures
+from walop_jax.diagnosis.screen import stepping
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.errors import DataError
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import changed
 from walop_jax.model.effects import Described, OtherDescription, effect_by_name
 from walop_jax.model.effects.base import Effect
@@ -169,3 +172,78 @@ def test_optics_ten_widths_beyond_their_prior_explain_nothing(monkeypatch, text,
         evidence, dataclasses.replace(trial, compared=FitComparison(heldout_before=2.0, heldout_after=1.0))
     )
     assert ("15 widths of its prior" in told) is refused
+
+
+def test_a_plate_in_the_beam_of_the_standards_alone_is_told():
+    """Four exposures of fifteen: a fit bends little, and χ²/dof of the whole set is that of an effect."""
+    calset = simulate(SMALL, seed=SEED).calset
+    there = simulate(SMALL, seed=SEED, effects=[plate_in_the_beam()]).calset
+    mixed = in_some_exposures(calset, there, calset.exposures.kind == "standard")
+    told = causes(mixed, base_model(mixed), left=20.0)
+    assert told[0].what == (
+        "CHWP was in the beam, at 0°, where the exposures say that it was out in exposures of kind standard"
+    )
+    assert told[0].explained < 1.2
+
+
+def test_the_share_of_the_light_that_an_exposure_misses():
+    """By hand: 3 % of the light of one exposure, nothing in the others; an error of 10 in 1000."""
+    counts, sigma = np.full((2, 3, 4), 1000.0), np.full((2, 3, 4), 10.0)
+    residual = np.zeros((2, 3, 4))
+    residual[:, 1] = 3.0
+    block = Mock(counts=counts, sigma=sigma)
+    likelihood = Mock(Likelihood, used=np.ones((2, 3), bool), residuals=lambda values: (None, residual))
+    likelihood.calset = Mock(points=[0, 1])
+    likelihood.calset.intensities.block = lambda first, last: block
+    assert _most_missed(likelihood, np.zeros(1)) == pytest.approx(0.03)
+
+
+def test_data_that_are_read_wrongly_are_refused_without_a_fit(monkeypatch, sound):
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("a fit was made")
+
+    monkeypatch.setattr(workflow, "fit", never)
+    with pytest.raises(DataError, match=r"it would if CLP_ANGLE runs the other way .*: give −CLP_ANGLE"):
+        diagnose(with_polariser(sound, -sound.exposures.clp_angle))
+    assert causes_before_a_fit(sound, base_model(sound))[1] is None
+
+
+def test_columns_of_two_moving_elements_are_exchanged_whole():
+    """Angles, and where each is in the beam."""
+    calset = simulate(WITH_PLATE, seed=SEED).calset
+    (one,) = _columns_exchanged(calset)
+    assert one.what == "the columns of CLP and CHWP were exchanged"
+    before, after = calset.exposures, one.change(calset).exposures
+    np.testing.assert_array_equal(after.position("CHWP").angle, before.clp_angle)
+    np.testing.assert_array_equal(after.clp_angle, before.position("CHWP").angle)
+    np.testing.assert_array_equal(after.clp_in, before.position("CHWP").inside)
+
+
+def test_filters_are_exchanged_or_counted_from_the_other_end():
+    """By hand: red, green and blue by their wavelengths, whatever their names."""
+    waves = {"A": 0.70, "B": 0.45, "C": 0.55}
+    curves = {name: FilterCurve(name, np.array([w]), np.array([1.0])) for name, w in waves.items()}
+    calset = simulate(SMALL, seed=SEED).calset
+    named = np.resize(np.array(["A", "B", "C"]), len(calset.exposures))
+    exposures = dataclasses.replace(calset.exposures, filter=named)
+    calset = dataclasses.replace(calset, exposures=exposures, filters=curves)
+    told = {one.what: one.change(calset).exposures.filter[:3].tolist() for one in _filters(calset)}
+    assert told == {
+        "the filters B and C were exchanged": ["A", "C", "B"],
+        "the filters B and A were exchanged": ["B", "A", "C"],
+        "the filters C and A were exchanged": ["C", "B", "A"],
+        "the filters were counted from the other end, A as B": ["B", "A", "C"],
+    }
+
+
+def test_the_zero_of_every_moving_element_may_have_stepped():
+    """5° on the plate in two exposures, of those where it is in the beam."""
+    calset = simulate(WITH_PLATE, seed=SEED).calset
+    likelihood = Likelihood.of(calset, base_model(calset))
+    told = {number.worded(5.0): number for number in stepping(likelihood)}
+    number = told["CHWP_ANGLE is 5° too small"]
+    assert "CLP_ANGLE is 5° too small" in told
+    at = calset.exposures.position("CHWP")
+    some = at.inside & (np.cumsum(at.inside) <= 2)
+    after = number.change(calset, 5.0, some).exposures.position("CHWP").angle
+    np.testing.assert_allclose(after - at.angle, np.where(at.inside, np.where(some, 5.0, 0.0), np.nan))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ FEW = 64  # field points up to which sets are looked at whole
 _NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing, …
 _MISSING = 20.0  # … if as many standard errors are missing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
+_FEW_FILTERS = 4  # up to which any two may be exchanged
 _LISTED = 8  # exposures that a sentence lists
 
 Change = Callable[[CalibrationSet], CalibrationSet]
@@ -47,7 +48,8 @@ class Alternative:
     """A discrete cause: what must have happened, what to do about it, and the set rewritten, or the model extended.
 
     `effects` are what the instrument differs by (a structural effect, another description); `explained` is the χ²/dof
-    at the field points that were looked at.
+    at the field points that were looked at. `number` says which number of the set is wrong, where that is the cause:
+    a diagnosis of it is a verdict, not a refusal.
     """
 
     what: str
@@ -55,6 +57,7 @@ class Alternative:
     change: Change = unchanged
     effects: tuple[Effect, ...] = ()
     explained: float = np.inf
+    number: str = ""
 
     def __str__(self) -> str:
         return f"{self.what} (χ²/dof = {self.explained:.3g}): {self.remedy}"
@@ -132,6 +135,8 @@ def readings(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
     """Readings that concern all exposures: cameras, angles, field points, moving elements in and out."""
     yield from _orders(model)
     yield from _angles(calset)
+    yield from _columns_exchanged(calset)
+    yield from _filters(calset)
     yield from _fields(calset, model)
     e = calset.exposures
     if e.clp_in.any():
@@ -375,6 +380,44 @@ def _angles(calset: CalibrationSet) -> Iterator[Alternative]:
             yield Alternative(
                 f"{column} is in radians", "give degrees, or the unit of the column", _with_angle(prefix, np.rad2deg)
             )  # fmt: skip
+
+
+def _columns_exchanged(calset: CalibrationSet) -> Iterator[Alternative]:
+    """Columns of two moving elements, each with the prefix of the other."""
+    moving = [prefix for prefix, at in calset.exposures.positions.items() if at.inside.any()]
+    for one, other in itertools.combinations(moving, 2):
+        yield Alternative(
+            f"the columns of {one} and {other} were exchanged",
+            f"exchange {one}_IN and {other}_IN, {one}_ANGLE and {other}_ANGLE",
+            with_part(
+                "exposures",
+                lambda e, one=one, other=other: e.placed(**{one: e.position(other), other: e.position(one)}),
+            ),
+        )
+
+
+def _filters(calset: CalibrationSet) -> Iterator[Alternative]:
+    """Names of two filters exchanged; bins of a spectrum counted from the other end."""
+    curves = calset.filters
+    names = sorted(
+        curves, key=lambda name: float(np.average(curves[name].wavelength, weights=curves[name].throughput))
+    )
+    for one, other in itertools.combinations(names, 2) if len(names) <= _FEW_FILTERS else ():
+        yield Alternative(
+            f"the filters {one} and {other} were exchanged",
+            "exchange their names in FILTER",
+            _with_column("filter", _renamed({one: other, other: one})),
+        )
+    if len(names) > 2:
+        yield Alternative(
+            f"the filters were counted from the other end, {names[-1]} as {names[0]}",
+            "give FILTER in the order of their wavelengths",
+            _with_column("filter", _renamed(dict(zip(names, names[::-1], strict=True)))),
+        )
+
+
+def _renamed(names: Mapping[str, str]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda column: np.array([names.get(name, name) for name in column.tolist()])
 
 
 def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:

@@ -300,8 +300,11 @@ def instead_of_a_search(first: State, conditions: Singles) -> Unexplained | None
     Nothing is searched for then: one number that turns such residuals into noise is what happened.
     """
     stated = number_alone(first.evidence.result, conditions)
-    if not stated:
-        return None
+    return wrong_number(first, stated) if stated else None
+
+
+def wrong_number(first: State, stated: str) -> Unexplained:
+    """The remainder that a number of the set explains, if it is wrong: nothing else is missing."""
     return Unexplained(first.evidence.table.p_global, f"{_WRONG}: {stated}", (), number=stated)
 
 

@@ -39,7 +39,7 @@ from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, pr
 from walop_jax.diagnosis.readings import with_places, with_values
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
 from walop_jax.fit.refit import NEARLY
-from walop_jax.io.text import beside, with_error
+from walop_jax.io.text import beside, with_error, with_minus_sign
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.laws import YEAR
@@ -76,6 +76,10 @@ class Stated(NamedTuple):
     value: float | None = None
     seen_by_stars: bool = False
     along: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]] | None = None
+
+    def changed_by(self, size: float) -> str:
+        """The number in words, changed by a size."""
+        return f"{self.what} changed by {with_minus_sign(f'{size:.3g}')} {self.unit}".rstrip()
 
 
 class Single(NamedTuple):
@@ -224,7 +228,7 @@ def _holds(score: Score, rival: Score) -> bool:
 
 def _conditions(design: Design, what: str = "") -> Iterator[Single]:
     """The numbers that the set states and that are used, or the one that is `what`."""
-    statements = [item for item in _stated(design.fit.calset) if what in ("", item.what)]
+    statements = [item for item in stated_numbers(design.fit.calset) if what in ("", item.what)]
     columns = [design.stacked([column[:, None]]) for column in _columns(design, statements)]
     for item, column in zip(statements, columns, strict=True):
         if not column.any():  # a number may be stated and not used
@@ -371,7 +375,8 @@ def _column(design: Design, statement: Stated) -> np.ndarray:
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
-def _stated(calset: CalibrationSet) -> Iterator[Stated]:
+def stated_numbers(calset: CalibrationSet) -> Iterator[Stated]:
+    """The numbers that a set states of its field, filters, light, sky and site."""
     errors = calset.stated_errors
     if len(calset.points) > 1:
         yield from _of_field(calset)

@@ -26,8 +26,8 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import Classes, only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
-from walop_jax.diagnosis.discrete import causes_of, refusal
-from walop_jax.diagnosis.exact import Trial, beyond_prior, context_of, signature, spoken_choices
+from walop_jax.diagnosis.discrete import causes_before_a_fit, causes_of, refusal
+from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, describe, descriptions_of
 from walop_jax.diagnosis.grammar import hypotheses
@@ -38,6 +38,7 @@ from walop_jax.diagnosis.remainder import (
     concluded,
     instead_of_a_search,
     rival_conditions,
+    wrong_number,
 )
 from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
@@ -50,7 +51,7 @@ from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, EffectKind
-from walop_jax.model.effects.in_models import known_effects
+from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model
 
@@ -90,15 +91,20 @@ def diagnose(
     if sample is not calset:
         tell(what.format(len(sample.points), len(calset.points)))
     tell(Stage("fitting the model", "fitting"))
+    context = effect_context(model.template, sample.exposures)
+    structural = [effect.neutral(context) for effect in candidates.effects if effect.is_structural()]
+    # Amplitudes mean nothing where the model is far off: what has none is asked first, and ends the comparison.
+    left, causes = (np.nan, ()) if as_written else causes_before_a_fit(sample, model, structural, tell)
+    if causes and causes[0].of_data and causes[0].explained < thresholds.READING_SURE:
+        raise refusal(left, causes)
     before = fit(Likelihood.of(sample, model))
-    structural = [
-        effect.neutral(context_of(before)) for effect in candidates.effects if effect.is_structural()
-    ]
-    # Amplitudes mean nothing where the fit is far off: what has none is asked first, and ends the comparison.
-    causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
     far_off = before.noise_scale > 1.0
+    if causes is None or not (far_off or any(cause.number for cause in causes)):
+        causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
+    number = causes[0].number if causes else ""
+    left = before.chi2 / max(before.dof, 1)
     if causes and causes[0].of_data and (far_off or causes[0].explained < thresholds.READING_SURE):
-        raise refusal(before, causes)
+        raise refusal(left, causes)
     judge = Refits(
         hypotheses=candidates,
         rng=np.random.default_rng(seed),
@@ -109,8 +115,11 @@ def diagnose(
     )
     tell(Stage("scoring every effect and pattern", "scoring"))
     first = State(judge.examined(before))
-    conditions = condition_scores(first.evidence.design) if far_off else Singles()
-    remainder = instead_of_a_search(first, conditions) if not causes else None
+    conditions = condition_scores(first.evidence.design) if far_off and not number else Singles()
+    if number:
+        remainder = wrong_number(first, number)
+    else:
+        remainder = instead_of_a_search(first, conditions) if not causes else None
     if remainder is None:
         begun = judge.with_causes(first, causes[0].effects if causes else ())
         state, remainder = concluded(first, search(begun, judge), judge)
@@ -118,8 +127,8 @@ def diagnose(
         state = first
     explained = state.evidence.result
     # Another reading that comes near competes with names and with other descriptions of the instrument.
-    if remainder and causes and causes[0].explained * explained.dof < explained.chi2:
-        raise refusal(before, causes)
+    if remainder and causes and not number and causes[0].explained * explained.dof < explained.chi2:
+        raise refusal(left, causes)
     if not conditions.items and (state.steps or remainder):
         conditions = condition_scores(first.evidence.design)
     if remainder is None or not remainder.number:
