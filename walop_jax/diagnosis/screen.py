@@ -29,7 +29,7 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.readings import Alternative, in_some_exposures, listed, with_block, with_part
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.model_of_set import model_like
-from walop_jax.fit.refit import Vector
+from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.light_path import NoSuchPlaceError
