@@ -292,7 +292,7 @@ def test_a_name_that_explains_a_fit_far_off_is_kept(monkeypatch):
 def test_scale_and_angle_are_sums_of_both_coordinates():
     """As differences of two sets that are scaled and turned."""
     design = Design.of(small_fit())
-    asked = [one for one in conditions._stated(small_fit().calset) if one.along is not None]
+    asked = [one for one in conditions.stated_numbers(small_fit().calset) if one.along is not None]
     assert [one.unit for one in asked] == ["deg", "deg", "", "rad"]
     for one, column in zip(asked, conditions._columns(design, asked), strict=True):
         exact = conditions._column(design, one)

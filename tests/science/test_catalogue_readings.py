@@ -10,18 +10,18 @@ from star_tables import stars
 
 from walop_jax.data.settings import Settings
 from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of
-from walop_jax.science.other_readings import Rows, turned
+from walop_jax.science.other_readings import CatalogueRows, turned
 
 ROTATOR = 35.0
 
 
 @pytest.fixture(scope="module")
-def sound(vectors) -> Rows:
+def sound(vectors) -> CatalogueRows:
     """A hundred and fifty stars with the noise of photons, on the sky."""
     table, _ = stars(vectors, 150, np.random.default_rng(3), teff=5500.0, rotator=(ROTATOR,))
     settings = dataclasses.replace(Settings.default(150), teff=np.full(150, 5500.0))
     place = np.array(table["X"]), np.array(table["Y"]), np.full(150, ROTATOR)
-    return Rows(np.arange(150), *place, np.array(table["N"]), np.array(table["N_ERR"]), settings)
+    return CatalogueRows(np.arange(150), *place, np.array(table["N"]), np.array(table["N_ERR"]), settings)
 
 
 def first(vectors, rows, **options) -> str:
@@ -30,11 +30,11 @@ def first(vectors, rows, **options) -> str:
     return found.words() if found.better else ""
 
 
-def ordered(rows: Rows, order) -> Rows:
+def ordered(rows: CatalogueRows, order) -> CatalogueRows:
     return rows.changed(counts=rows.counts[:, order], sigma=rows.sigma[:, order])
 
 
-def placed(rows: Rows, x, y) -> Rows:
+def placed(rows: CatalogueRows, x, y) -> CatalogueRows:
     return rows.changed(x=x, y=y)
 
 

@@ -89,7 +89,7 @@ ERRORS = (
     planted("model/light_path.py", "else np.mod(readings, period)", "else readings", "model/test_readings.py"),
     planted("calibration/analysis_vectors.py", "patched.within_period(prefix, reading)", "reading",
             "model/test_readings.py"),
-    planted("model/elements/base.py", "cls.period = None", "cls.period = 360.0", "model/test_readings.py"),
+    planted("model/elements/base.py", 'own.get("period")', 'own.get("period", 360.0)', "model/test_readings.py"),
     planted("model/effects/factors.py", "(int(order) * angle)", "(2 * int(order) * angle)",
             "model/effects/test_effects_of_light.py"),
     planted("model/effects/optics.py", "else (x, y + by)", "else (x + by, y)",

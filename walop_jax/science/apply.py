@@ -30,7 +30,7 @@ from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of,
 from walop_jax.science.colours import ignored_colour, unsure_colour
 from walop_jax.science.detectors import detector_slopes, errors_of, linearised
 from walop_jax.science.estimate import Estimate, calibration_shift, estimate
-from walop_jax.science.other_readings import Rows as ReadRows
+from walop_jax.science.other_readings import CatalogueRows
 from walop_jax.science.star_columns import PossibleChange
 from walop_jax.science.star_light import OwnLight, unpolarised, with_sky
 from walop_jax.science.star_residuals import StarResiduals, by_place
@@ -377,7 +377,7 @@ class _Application:
         star = np.unique(catalogue.star[r], return_inverse=True)[1].reshape(-1)
         rotator = catalogue.rotator[r] + np.rad2deg(self.offset)
         place, settings = (points.x[r], points.y[r]), points.settings[r]
-        rows = sample_of(ReadRows(star, *place, rotator, self.counts[r], self.sigma[r], settings))
+        rows = sample_of(CatalogueRows(star, *place, rotator, self.counts[r], self.sigma[r], settings))
         return readings_of(self.vectors, rows, doubted=doubted) if len(rows.x) else None
 
     @property

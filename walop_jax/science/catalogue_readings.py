@@ -24,7 +24,7 @@ import numpy as np
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.science import other_readings as tried_as
-from walop_jax.science.other_readings import FEWEST, CatalogueReading, Fit, Judge, Rows
+from walop_jax.science.other_readings import FEWEST, CatalogueReading, CatalogueRows, Fit, Judge
 
 STARS = 300  # that are looked at
 DISAGREE = 0.1
@@ -97,7 +97,9 @@ class CatalogueReadings:
         return {**about, "readings": [reading.document() for reading in self.better]}
 
 
-def readings_of(vectors: AnalysisVectors, rows: Rows, *, doubted: bool = False) -> CatalogueReadings | None:
+def readings_of(
+    vectors: AnalysisVectors, rows: CatalogueRows, *, doubted: bool = False
+) -> CatalogueReadings | None:
     """The readings of a sample of a catalogue that mend it; None of few stars, or without a camera to spare.
 
     `rows` are at any place of the field, those of `counts` that are not used NaN. All readings are tried where the
@@ -155,7 +157,7 @@ def _mends(reading: CatalogueReading, stands: Fit) -> bool:
     return fit.loss < stands.loss - BETTER and agrees and sums and excess <= before / 4.0
 
 
-def sample_of(rows: Rows) -> Rows:
+def sample_of(rows: CatalogueRows) -> CatalogueRows:
     """Some `STARS` bright stars of rows that have all cameras, or as many as there are."""
     count = int(rows.star.max(initial=-1)) + 1
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -171,7 +173,7 @@ def sample_of(rows: Rows) -> Rows:
     return rows.of(chosen[rows.star])
 
 
-def _other_stars(judge: Judge, rows: Rows) -> OtherStars | None:
+def _other_stars(judge: Judge, rows: CatalogueRows) -> OtherStars | None:
     """The camera whose light in some rows is not that of the star that all others see; None where none is so."""
     names = judge.vectors.instrument.cameras.names
     inside = judge.within(rows)

@@ -51,7 +51,7 @@ Turn = Callable[[OfRows, OfRows], tuple[OfRows, OfRows]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Rows:
+class CatalogueRows:
     """Rows of whole stars: field positions and ROTATOR (deg; NaN: none), counts and errors (electron), settings.
 
     `star` numbers the stars from 0 in ascending order. `rewritten` is True where counts are other than they were given.
@@ -65,13 +65,13 @@ class Rows:
     sigma: Float[np.ndarray, "r k"]
     settings: Settings
 
-    def of(self, keep: Bool[np.ndarray, " r"]) -> Rows:
+    def of(self, keep: Bool[np.ndarray, " r"]) -> CatalogueRows:
         """Some of the rows, of whole stars."""
         arrays = {n: v[keep] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
         arrays["star"] = np.unique(arrays["star"], return_inverse=True)[1].reshape(-1)
-        return Rows(**arrays, settings=self.settings[np.flatnonzero(keep)])
+        return CatalogueRows(**arrays, settings=self.settings[np.flatnonzero(keep)])
 
-    def changed(self, **columns: Any) -> Rows:
+    def changed(self, **columns: Any) -> CatalogueRows:
         """The same with other columns."""
         return dataclasses.replace(self, **columns)
 
@@ -103,7 +103,7 @@ class CatalogueReading:
 
     what: str
     remedy: str
-    change: Callable[[Rows], Rows]
+    change: Callable[[CatalogueRows], CatalogueRows]
     fit: Fit = NO_FIT
     usual: bool = False
     searched: bool = False
@@ -124,14 +124,14 @@ class Judge:
     def __init__(self, vectors: AnalysisVectors) -> None:
         self.vectors = vectors
 
-    def judged(self, reading: CatalogueReading, rows: Rows) -> CatalogueReading:
+    def judged(self, reading: CatalogueReading, rows: CatalogueRows) -> CatalogueReading:
         """A reading with how well it fits; not at all where it cannot be made."""
         try:
             return dataclasses.replace(reading, fit=self.fit(reading.change(rows)))
         except (ValueError, np.linalg.LinAlgError):
             return reading
 
-    def vectors_at(self, rows: Rows) -> Float[np.ndarray, "r k 3"]:
+    def vectors_at(self, rows: CatalogueRows) -> Float[np.ndarray, "r k 3"]:
         """Analysis vectors of rows in the frame of the instrument."""
         settings = self.vectors.reduced(rows.settings)
         found = np.empty((len(rows.x), self.vectors.cameras, 3))
@@ -141,17 +141,17 @@ class Judge:
             found[same] = np.einsum("rc,rcks->rks", colour_weights(teff, COLOURS), spectra)
         return found
 
-    def within(self, rows: Rows) -> Rows:
+    def within(self, rows: CatalogueRows) -> CatalogueRows:
         """Rows of stars that lie in the field."""
         outside = np.maximum(np.abs(rows.x), np.abs(rows.y)) > self.vectors.half_width
         return rows.of(np.bincount(rows.star, outside)[rows.star] == 0) if outside.any() else rows
 
-    def unpolarised(self, rows: Rows) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, "r k"]]:
+    def unpolarised(self, rows: CatalogueRows) -> tuple[Float[np.ndarray, "r k"], Float[np.ndarray, "r k"]]:
         """Counts of the rows in the field, and those of unpolarised stars of unit flux."""
         rows = self.within(rows)
         return rows.counts, self.vectors_at(rows)[..., 0]
 
-    def fit(self, rows: Rows) -> Fit:
+    def fit(self, rows: CatalogueRows) -> Fit:
         """How well rows agree; stars beyond the field do not count, unless most lie there."""
         count = int(rows.star.max()) + 1
         rows = self.within(rows)
@@ -210,11 +210,11 @@ def orders(names: Sequence[str], arms: Sequence[Sequence[int]] | None = None) ->
         )
 
 
-def units(rows: Rows) -> Iterator[CatalogueReading]:
+def units(rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """Magnitudes in the place of intensities."""
     if rows.counts.size and np.nanmax(np.abs(rows.counts)) < _MAGNITUDES:
 
-        def intensities(r: Rows) -> Rows:
+        def intensities(r: CatalogueRows) -> CatalogueRows:
             counts = 10.0 ** (-0.4 * (r.counts - np.nanmedian(r.counts)))
             return r.changed(counts=counts, sigma=0.4 * np.log(10.0) * counts * r.sigma)
 
@@ -223,8 +223,8 @@ def units(rows: Rows) -> Iterator[CatalogueReading]:
         )
 
 
-def _placed(turn: Turn) -> Callable[[Rows], Rows]:
-    def change(rows: Rows) -> Rows:
+def _placed(turn: Turn) -> Callable[[CatalogueRows], CatalogueRows]:
+    def change(rows: CatalogueRows) -> CatalogueRows:
         x, y = turn(rows.x, rows.y)
         return rows.changed(x=x, y=y)
 
@@ -252,7 +252,7 @@ def turned(x: OfRows, y: OfRows, angle: float | OfRows) -> tuple[OfRows, OfRows]
     return c * x + s * y, c * y - s * x
 
 
-def rotators(rows: Rows) -> Iterator[CatalogueReading]:
+def rotators(rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """ROTATOR of another sign, zero or unit, where X and Y were made with it, and where they were not."""
     known = np.isfinite(rows.rotator)
     if not known.all():
@@ -271,7 +271,7 @@ def rotators(rows: Rows) -> Iterator[CatalogueReading]:
     made = "; X and Y are made with it"
     for what, remedy, change in changes:
 
-        def both(r: Rows, change: Callable[[OfRows], OfRows] = change) -> Rows:
+        def both(r: CatalogueRows, change: Callable[[OfRows], OfRows] = change) -> CatalogueRows:
             centre = np.full(len(r.x), typical) if one else r.rotator
             turn = change(centre) - centre
             x, y = turned(r.x, r.y, turn)
@@ -286,7 +286,7 @@ def rotators(rows: Rows) -> Iterator[CatalogueReading]:
             )
 
 
-def turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def turns(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """The field turned by any angle, which is searched."""
     few = _some_of(rows)
 
@@ -307,7 +307,7 @@ def turns(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     )
 
 
-def radians(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def radians(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """X and Y in radians, where the field would hold them."""
     largest = max(float(np.abs(rows.x).max()), float(np.abs(rows.y).max()))
     if 0 < np.rad2deg(largest) <= 1.5 * judge.vectors.half_width:
@@ -316,7 +316,7 @@ def radians(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         )
 
 
-def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def scales(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """The field stretched, as a whole or along right ascension, by factors that are searched."""
     few = _some_of(rows)
 
@@ -364,15 +364,15 @@ def scales(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     )
 
 
-def shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def shifts(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """The field shifted, by what is searched."""
     few, reach = _some_of(rows), _RANGE * judge.vectors.half_width
 
-    def moved(shift: Float[np.ndarray, " 2"]) -> Callable[[Rows], Rows]:
+    def moved(shift: Float[np.ndarray, " 2"]) -> Callable[[CatalogueRows], CatalogueRows]:
         dx, dy = shift.tolist()
         return _placed(lambda x, y: (x + dx, y + dy))
 
-    def misfit(shift: Float[np.ndarray, " 2"], of: Rows = few) -> float:
+    def misfit(shift: Float[np.ndarray, " 2"], of: CatalogueRows = few) -> float:
         return min(judge.fit(moved(shift)(of)).misfit, 1e30)
 
     steps = np.linspace(-reach, reach, 2 * _SHIFTS + 1)
@@ -401,13 +401,13 @@ def shifts(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
     )
 
 
-def _some_of(rows: Rows) -> Rows:
+def _some_of(rows: CatalogueRows) -> CatalogueRows:
     """Every n-th star of rows, some `_SEARCHED` of them."""
     every = -(-(int(rows.star.max()) + 1) // _SEARCHED)
     return rows.of(rows.star % every == 0)
 
 
-def filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[CatalogueReading]:
+def filters(vectors: AnalysisVectors, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """Other filters, where all rows are of one."""
     stated = np.unique(rows.settings.filter)
     if len(stated) > 1:
@@ -417,7 +417,7 @@ def filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[CatalogueReading]:
     for name in names:
         if name != stated[0]:
 
-            def change(r: Rows, name: str = name) -> Rows:
+            def change(r: CatalogueRows, name: str = name) -> CatalogueRows:
                 other = dataclasses.replace(r.settings, filter=np.full(len(r.x), name))
                 return r.changed(settings=other)
 
@@ -426,7 +426,7 @@ def filters(vectors: AnalysisVectors, rows: Rows) -> Iterator[CatalogueReading]:
             )
 
 
-def gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def gains(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """Another gain of one camera, or of one arm, by which unpolarised stars have the shares of the calibration."""
     cameras = judge.vectors.instrument.cameras
     names, count = cameras.names, len(cameras)
@@ -447,7 +447,7 @@ def gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
                 )
 
 
-def all_gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
+def all_gains(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
     """Other gains of all cameras: those of another instrument, say."""
     names = judge.vectors.instrument.cameras.names
     counts, expected = judge.unpolarised(rows)
@@ -465,5 +465,5 @@ def all_gains(judge: Judge, rows: Rows) -> Iterator[CatalogueReading]:
         )
 
 
-def _scaled(factors: Float[np.ndarray, " k"]) -> Callable[[Rows], Rows]:
+def _scaled(factors: Float[np.ndarray, " k"]) -> Callable[[CatalogueRows], CatalogueRows]:
     return lambda rows: rows.changed(counts=rows.counts * factors, sigma=rows.sigma * factors)

@@ -52,8 +52,8 @@ OF_SURVEYS = ("gain", "x", "y")
 _UNITS = {"flux": "per 1e6 electron", "light": "electron"}
 _REFERENCE = 1e6  # electron
 
-Place = tuple[float, ...]  # centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge
-Vector = Float[np.ndarray, " r"]  # a number for each row
+SpotPlace = tuple[float, ...]  # centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge
+RowValues = Float[np.ndarray, " r"]  # a number for each row
 Sum = dict[int, float]  # weights of columns by their numbers
 
 
@@ -67,7 +67,7 @@ def chance_of(sigma: float) -> float:
     return float(2.0 * special.ndtr(-abs(sigma)))
 
 
-def profile(x: Vector, y: Vector, place: Place) -> Vector:
+def profile(x: RowValues, y: RowValues, place: SpotPlace) -> RowValues:
     """A spot at positions (deg): exp(−(d/s)ᵐ/2), 0 beyond `REACH` sizes s; m = 2 where a place does not say."""
     far = ((x - place[0]) ** 2 + (y - place[1]) ** 2) / place[2] ** 2
     power = 0.5 * place[3] if len(place) > 3 else 1.0
@@ -109,7 +109,7 @@ class PossibleChange(NamedTuple):
     error: float = np.inf
     unit: str = ""
     kind: str = "gain"
-    place: Place = ()
+    place: SpotPlace = ()
     widest: float = np.inf
 
     @property
@@ -168,7 +168,9 @@ class Growth(NamedTuple):
             return growth
         return growth._replace(middle=0.5 * float(times.min() + times.max()), half=0.5 * float(np.ptp(times)))
 
-    def electrons(self, change: PossibleChange, x: Vector, y: Vector, time: Vector, counts: Vector) -> Vector:
+    def electrons(
+        self, change: PossibleChange, x: RowValues, y: RowValues, time: RowValues, counts: RowValues
+    ) -> RowValues:
         """Electrons that a change of unit size adds to `counts` of a camera of its own."""
         if change.kind == "light":
             return np.ones_like(counts)

@@ -46,6 +46,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize, special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.io.shapes import OfStars
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import star_columns as alarms
 from walop_jax.science import star_residuals as residuals
@@ -54,8 +55,8 @@ from walop_jax.science.star_columns import (
     MOST_LIKELY,
     OF_CATALOGUES,
     RIVAL,
-    Place,
     PossibleChange,
+    SpotPlace,
     StarColumns,
     profile,
     rivals_of,
@@ -78,13 +79,12 @@ _BLIND = 1e-3  # cᵀPc over cᵀc below which a star does not see a camera
 _MOST = 8  # places
 _WIDER = 2.0  # than the size that was looked for a place may be, and so far off its centre
 
-Matrix = Float[np.ndarray, "c c"]
+ColumnProducts = Float[np.ndarray, "c c"]
 Sizes = Float[np.ndarray, " c"]  # of all columns
-OfStars = Float[np.ndarray, " s"]
 
 
 def scored(
-    changes: Sequence[PossibleChange], matrix: Matrix, score: Sizes, beside: Sequence[int] = ()
+    changes: Sequence[PossibleChange], matrix: ColumnProducts, score: Sizes, beside: Sequence[int] = ()
 ) -> list[PossibleChange]:
     """Changes with size and error, each alone beside the others; those of numbers `beside` have no answer here.
 
@@ -353,7 +353,7 @@ def with_own_light(
 class _Look(NamedTuple):
     noise: Scale
     rows: Scale | None
-    matrix: Matrix
+    matrix: ColumnProducts
     score: Sizes
 
 
@@ -381,7 +381,7 @@ class Seen(NamedTuple):
         """Some of the stars."""
         return Seen(*(values[chosen] for values in self))
 
-    def near(self, place: Place) -> Seen:
+    def near(self, place: SpotPlace) -> Seen:
         """The stars that a place of several times its size may hold."""
         return self.of(profile(self.x, self.y, (*place[:2], _WIDER * place[2])) > 0)
 
@@ -389,7 +389,7 @@ class Seen(NamedTuple):
 class Strongest(NamedTuple):
     """The place of the largest |Z|: its sign and size, the number of the camera, and the number of trials."""
 
-    place: Place
+    place: SpotPlace
     sigma: float
     camera: int
     trials: int
@@ -529,7 +529,7 @@ def _smoothed(
 def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> DisagreeingPlace:
     """The place about the strongest one, with the cameras that describe its stars as well as the best one."""
     subset = seen.near(found.place)
-    fits: list[tuple[tuple[float, float, float], Place, int]] = []
+    fits: list[tuple[tuple[float, float, float], SpotPlace, int]] = []
     for k in range(len(cameras)):
         place = fitted(subset, k, found.place)
         fits.append((share_of(subset, k, profile(subset.x, subset.y, place)), place, k))
@@ -546,11 +546,11 @@ def _described(seen: Seen, found: Strongest, cameras: Sequence[str]) -> Disagree
     return DisagreeingPlace(x, y, size, found.sigma, stars, tuple(alike), tuple(numbers))
 
 
-def fitted(seen: Seen, camera: int, start: Place) -> Place:
+def fitted(seen: Seen, camera: int, start: SpotPlace) -> SpotPlace:
     """The place at which a camera describes the stars best, near the one that was looked for, its edge as sharp."""
     x, y, size, *edge = start
 
-    def place(moved: Float[np.ndarray, " 3"]) -> Place:
+    def place(moved: Float[np.ndarray, " 3"]) -> SpotPlace:
         return (x + size * float(moved[0]), y + size * float(moved[1]), size * float(np.exp(moved[2])), *edge)
 
     def misfit(moved: Float[np.ndarray, " 3"]) -> float:
@@ -563,7 +563,7 @@ def fitted(seen: Seen, camera: int, start: Place) -> Place:
     return place(solution.x)
 
 
-def described(seen: Seen, camera: int, place: Place, size: float) -> Bool[np.ndarray, " s"]:
+def described(seen: Seen, camera: int, place: SpotPlace, size: float) -> Bool[np.ndarray, " s"]:
     """Stars whose shift is that of a camera at a place, to `CUT` standard errors or to half of it: spots have edges."""
     shift = size * seen.alpha[:, camera] * profile(seen.x, seen.y, place)
     return (shift != 0) & (np.abs(seen.z[:, camera] - shift) < CUT + 0.5 * np.abs(shift))
