@@ -6,9 +6,9 @@
 
 Scenes of the benchmark are judged at the first look, with no fit; FOLDER has to be of the same seed. `--today` judges
 them by the search as well, as the pairs in any case. With `--fits` sets of the grammar of `sealed.py` are diagnosed
-twice: with the search of today, and with the loop below in its place, everything else being equal.
+twice: with the search of today, and with the choice below of what is tried and added (`_next`), all else being equal.
 
-The loop: the most certain thing is asked first, its names are fitted, the most probable first, until one of them is,
+The choice: the most certain thing is asked first, its names are fitted, the most probable first, until one of them is,
 with what its fit found beyond the linear step, more probable than every name that was not fitted. The first that data
 which took no part in its fit confirm is added, and the residuals are scored again.
 """
@@ -41,7 +41,7 @@ from judge import opened, sentences  # noqa: E402
 from selection import CERTAIN, Posterior, Thing, most_probable  # noqa: E402
 from study_options import options_of  # noqa: E402
 
-from walop_jax.diagnosis import thresholds, workflow  # noqa: E402
+from walop_jax.diagnosis import search, thresholds  # noqa: E402
 from walop_jax.diagnosis.exact import Trial  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
 from walop_jax.diagnosis.hypotheses import Probe, Ranked  # noqa: E402
@@ -132,20 +132,6 @@ def _both(
 # ------------------------------------------------------------------------------------------------- with exact fits
 
 
-def search(state: State, judge: Any) -> State:
-    """The loop, in the place of `search.search`."""
-    for _ in range(thresholds.MOST_STEPS):
-        if not state.evidence.alarm:
-            break
-        if ended := judge.over(state.fits):
-            return dataclasses.replace(state, ended=ended)
-        trial, state = _next(state, judge)
-        if trial is None:
-            break
-        state = judge.adopted(state, trial)
-    return state
-
-
 def _refused(trial: Trial) -> str:
     """Reason not to add a fitted trial; empty: there is none."""
     assert trial.fit is not None
@@ -211,7 +197,10 @@ def _named(evidence: Evidence, name: str, shapes: Mapping[str, tuple[Probe, ...]
 
 
 def _next(state: State, judge: Any) -> tuple[Trial | None, State]:
-    """The most probable addition that is not refused (None: all are), and the state with the reasons."""
+    """The most probable addition that is not refused (None: all are), as `search._next` of today.
+
+    And the state with the reasons.
+    """
     evidence, choices, accepted, others_asked = state.evidence, state.choices, None, False
     things = sorted(most_probable(evidence).things, key=lambda t: -next(iter(t.probabilities.values()), 0.0))
     turn = Asked(evidence, judge, state.fits)
@@ -265,8 +254,8 @@ def sets(seed: int, first: int, count: int, save: Path | None) -> None:
     options = SimpleNamespace(seed=seed, side=8, refit_only=False, minutes=None)
     outcomes: dict[str, list[Any]] = {"today": [], "law": []}
     for number in range(first, first + count):
-        for name, real in {"today": workflow.search, "law": search}.items():
-            with patch.object(workflow, "search", real):
+        for name, choice in {"today": search._next, "law": _next}.items():
+            with patch.object(search, "_next", choice):
                 outcomes[name].append(sealed.outcome(number, options))  # type: ignore[arg-type]
             print(name, sealed.line(number, outcomes[name][-1]), flush=True)
             if save:

@@ -153,15 +153,6 @@ def _compared(
         return look.explaining(of_some, look.enough)
     tell("comparing discrete causes: plates, beams and cables, signs, zeros and units of the data")
     of_all = list(readings(few, model))
-    described = [
-        Alternative(
-            sentence,
-            "correct the description of the instrument",
-            effects=(OtherDescription(change=sentence),),
-        )
-        for sentence in alternatives(model.template)
-        if descriptions and OtherDescription.name not in model.effect_names
-    ]
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
     sure, far_off = thresholds.READING_SURE, left >= FAR_OFF
     if not far_off:
@@ -311,9 +302,8 @@ class _Look:
 
     def pairs(self, items: Sequence[Alternative]) -> tuple[Alternative, ...]:
         """Two causes at once that explain the data: of the best alone, each with the best beside it."""
-        stands, _ = misfit_after(
-            self.likelihood, self.left, STEPS[0]
-        )  # as they were tried, not as it was fitted
+        # As they were tried, not as the set was fitted.
+        stands, _ = misfit_after(self.likelihood, self.left, STEPS[0])
         firsts = sorted((item for item in self.tried if item.explained < _HELPS * stands), key=_left)
         for first in firsts[:BEST]:
             try:
