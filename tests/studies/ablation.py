@@ -215,7 +215,7 @@ class Scenes:
     def judged(self, number: int) -> dict[str, Any]:
         """Verdict and additions, and what is right of them."""
         scene = self._scene(number)
-        verdict = self.blind.with_verdict(scene, self.blind.start(scene))[0]
+        verdict = self.blind.judged(scene, self.blind.start(scene))[0]
         return {
             "kind": verdict.kind,
             "added": list(verdict.added),
@@ -244,7 +244,7 @@ def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
     before, where = {}, {rule.text: list[int]() for rule in OF_LINEAR_STEPS}
     for scene in scenes.truth:
         with watched(OF_LINEAR_STEPS) as decided:
-            before[scene] = scenes.with_verdict(scene)
+            before[scene] = scenes.judged(scene)
         for text in decided:
             where[text].append(scene)
     print("with all rules", Counter(judged["outcome"] for judged in before.values()), flush=True)
@@ -253,7 +253,7 @@ def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
         changed = better = worse = 0
         with without(rule):
             for scene in where[rule.text]:
-                now = scenes.with_verdict(scene)
+                now = scenes.judged(scene)
                 changed += any(now[key] != before[scene][key] for key in ("kind", "added"))
                 gain = WORTH[before[scene]["outcome"]] - WORTH[now["outcome"]]
                 better, worse = better + (gain > 0), worse + (gain < 0)

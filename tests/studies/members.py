@@ -49,7 +49,7 @@ def judged(seed: int) -> sealed.Judged:
     some = [probe for probe in every if probe.name.startswith(KINDS)]
     state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
     classes = ambiguities(state, {TOLD: ()})
-    return sealed.with_verdict(averaged(Calibration.from_fit(result), classes), True, one)
+    return sealed.judged(averaged(Calibration.from_fit(result), classes), True, one)
 
 
 def main() -> None:

@@ -135,7 +135,7 @@ def search(bench: Bench) -> Callable[[int], Answer]:
         along = blind._whitening.T @ evidence.design.products(evidence.columns, evidence.design.projector(r))
         seen = Scene("", (), 0.0, along, float(r @ r - along @ along), removed=(str(bench.without[scene]),))
         start = blind.start(seen)
-        verdict, left = blind.with_verdict(seen, start)
+        verdict, left = blind.judged(seen, start)
         names = [
             probe if effect == "described" else effect
             for effect, probe in zip(verdict.named, verdict.added, strict=True)

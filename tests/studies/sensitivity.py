@@ -43,7 +43,7 @@ def changed(scenes: Scenes, name: str, factor: float) -> tuple[int, int, int]:
     replaced = type(value)(max(value * factor, 1)) if isinstance(value, int) else value * factor
     with patch.object(thresholds, name, replaced):
         for number, before in scenes.as_they_are.items():
-            now = scenes.with_verdict(number)
+            now = scenes.judged(number)
             gain = WORTH[before["outcome"]] - WORTH[now["outcome"]]
             counts[0] += any(now[key] != before[key] for key in ("kind", "added"))
             counts[1] += gain > 0
@@ -59,7 +59,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     scenes = Scenes(options.folder, options.seed, options.each, options.quiet, options.pairs)
     scenes.as_they_are = {
-        number: scenes.with_verdict(number) for number in list(scenes.truth)[:: options.every]
+        number: scenes.judged(number) for number in list(scenes.truth)[:: options.every]
     }
     print(
         f"| number | half of it, of {len(scenes.as_they_are)} scenes: changed; better; worse with it | twice |"
