@@ -14,7 +14,6 @@ from walop_jax.data.records import CalibrationSet, FilterCurve, Position
 from walop_jax.diagnosis import search, workflow
 from walop_jax.diagnosis.discrete import _most_missed, causes, causes_before_a_fit
 from walop_jax.diagnosis.exact import Trial
-from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import FitComparison
 from walop_jax.diagnosis.readings import Alternative, _columns_exchanged, _filters, in_some_exposures
 from walop_jax.diagnosis.screen import stepping
@@ -165,12 +164,11 @@ def test_optics_ten_widths_beyond_their_prior_explain_nothing(monkeypatch, text,
     change = Change.parsed(text)
     monkeypatch.setattr(search, "descriptions_of", lambda fit: ((change, 1.0, 0.01),))
     monkeypatch.setattr(search, "beyond_prior", lambda fit, name: {change.label: 15.0})
-    trial = Trial(Described, 1e4, 100.0, noise=True, fit=Mock(FitResult, converged=True))
-    kept = {"evidence_needed": 0.0, "floor": 1.0, "chi2": 1e6, "dof": 100, "poor": True}
-    evidence = Mock(Evidence, **kept, stands=lambda *_: True)
-    told = search.refused(
-        evidence, dataclasses.replace(trial, compared=FitComparison(heldout_before=2.0, heldout_after=1.0))
-    )
+    trial = Trial(
+        Described, 1e4, 100.0, noise=True, fit=Mock(FitResult, converged=True),
+        compared=FitComparison(heldout_before=2.0, heldout_after=1.0),
+    )  # fmt: skip
+    told = search.against(trial)
     assert ("15 widths of its prior" in told) is refused
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from scipy import integrate, stats
 
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import exact, refits, search, thresholds
+from walop_jax.diagnosis import exact, refits, thresholds
 from walop_jax.diagnosis.design import Design, Measured, strata
-from walop_jax.diagnosis.examination import Evidence, upper_limit
+from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
@@ -264,33 +263,3 @@ def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     assert refits.predicts_unseen(optics, vectors(optics), thresholds.USEFUL)
-
-
-@pytest.mark.parametrize(
-    ("effect", "chi2", "explained", "told"),
-    [
-        # χ² 11 000 of 10 000: 1000 are missing, 1000 − 2 √20 000 = 717 surely, a quarter of which is 179.
-        (effect_by_name("blemish"), 11_000.0, 175.0, False),
-        (effect_by_name("blemish"), 11_000.0, 183.0, True),
-        (Described, 11_000.0, 5.0, True),
-        # χ² 10 300: 17 are surely missing, 4.3 of them a quarter.
-        (effect_by_name("blemish"), 10_300.0, 4.4, True),
-        (effect_by_name("blemish"), 10_300.0, 4.1, False),
-        # A poor fit may lack many things.
-        (effect_by_name("blemish"), 16_000.0, 5.0, True),
-    ],
-)
-def test_a_name_must_explain_a_quarter_of_what_is_surely_missing(effect, chi2, explained, told):
-    state = Mock(
-        Evidence,
-        chi2=chi2,
-        dof=10_000,
-        poor=chi2 > 15_000,
-        floor=1.0,
-        evidence_needed=0.0,
-        probes=(),
-        stands=lambda *_, **__: True,
-    )
-    reason = search.refused(state, exact.Trial(effect, 50.0, chi2 - explained, noise=False))
-    assert (reason == "") is told
-    assert told or f"explains {explained:.4g} of {chi2 - 10_000:.4g} that are missing" in reason

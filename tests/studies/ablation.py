@@ -1,20 +1,12 @@
-"""What each rule of the search is worth: every one switched off, on scenes of linear steps and on sets that are fitted.
+"""What each rule of the search is worth: every one switched off, on sets that are fitted.
 
-    python tests/studies/benchmark/generate.py OLD
-    python tests/studies/benchmark/generate.py NEW --seed 2 --new
-    python tests/studies/ablation.py OLD NEW [--each 1] [--quiet 40] [--pairs 40]       (a quarter of an hour)
-    python tests/studies/ablation.py --fits [--seed 2] [--first 0] [--budget MINUTES] [--save FILE]
+    python tests/studies/ablation.py [--seed 2] [--first 0] [--budget MINUTES] [--save FILE]
     python tests/studies/ablation.py --join FILE...
 
-OLD are the published scenes, on which the rules were made; NEW have another simulated run, other noise, and shapes that
-are nowhere else (`benchmark/new_shapes.py`). Of each shape and ratio `--each` scenes are taken, `--quiet` in which
-nothing is hidden, and beside NEW `--pairs` of two effects of the catalogue. With `--fits` sets come from the grammar of
-`sealed.py`, and the search fits them as a diagnosis does. A rule is asked only of scenes in which it decides something;
-the others cannot change.
-
-The table has, for each rule, the scenes in which it decides, those whose additions or verdict change without it, and
-how many of these are better and worse *with* it: right or in its class before open before wrong. Of sets also those
-whose matrix between the points is nearer to the truth, or farther off, by 1.2 ×, and that are trusted and wrong.
+Sets come from the grammar of `sealed.py`. A rule is asked only of sets in which it decides something; the others cannot
+change. The table has, for each rule, the sets in which it decides, those whose verdict or matrix changes without it,
+and how many of these are better and worse *with* it: right or in its class before open before wrong; those whose matrix
+between the points is nearer to the truth, or farther off, by 1.2 ×; and those that are trusted and wrong.
 """
 
 from __future__ import annotations
@@ -24,7 +16,6 @@ import dataclasses
 import pickle
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,15 +28,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies/benchmark"))]
 
-from blind import Scene  # noqa: E402
-from generate import STEP, Layout  # noqa: E402
-from judge import opened  # noqa: E402
 from studies.sealed import WORSE, Sealed, is_trusted, refusal_of, sealed, verdict_of  # noqa: E402
 from studies.sealed_judging import judged, right_of  # noqa: E402
 from study_options import options_of  # noqa: E402
 
 from walop_jax.data.records import CalibrationSet  # noqa: E402
-from walop_jax.diagnosis import exact, examination, refits, remainder, search, thresholds, workflow  # noqa: E402
+from walop_jax.diagnosis import exact, refits, remainder, search, thresholds, workflow  # noqa: E402
 from walop_jax.diagnosis.design import Design  # noqa: E402
 from walop_jax.diagnosis.examination import Evidence  # noqa: E402
 from walop_jax.diagnosis.findings import FitComparison  # noqa: E402
@@ -94,27 +82,13 @@ def _of(text: str) -> Callable[[tuple[Any, ...], Any], bool]:
     return lambda args, answer: answer.startswith(text)
 
 
-REFUSED: tuple[Place, ...] = ((search, "refused"),)
+REFUSED: tuple[Place, ...] = ((search, "against"),)
 RULES = (
-    # Those of linear steps as well
-    Rule("a name explains a quarter of what is surely missing (`LEAST_SHARE_OF_NAME`)",
-         ((thresholds, "LEAST_SHARE_OF_NAME"),), number(0.0), _of("it explains"), REFUSED),
-    Rule("one-sided amplitudes on their side (`follow_physics`)",
-         ((examination, "follow_physics"),), always(True), refuses),
-    Rule("patterns without a name compete (`stands`)", ((Evidence, "stands"),), always(True), refuses),
-    Rule("names within ln B = 8 of the best are tried (`leaders`)",
-         ((search, "leaders"),), lambda _: lambda ranked: ranked[:1], lambda args, answer: len(answer) > 1),
-    Rule("above ln B = 150 trials may be better than their linear step (`LINEAR_BELOW`)",
-         ((thresholds, "LINEAR_BELOW"),), number(np.inf),
-         lambda args, answer: bool(answer) and answer[0].log_bayes > thresholds.LINEAR_BELOW, ((search, "leaders"),)),
-    Rule("evidence counts in units of the scatter behind all candidates (`FLOOR`)",
-         ((thresholds, "FLOOR"),), number(np.inf), lambda args, answer: args[0].floor > 1.0, REFUSED),
-    # Those of fits
     Rule("a description predicts states and cells by its linear step, to be fitted (`_hopeful`)",
          ((Refits, "_hopeful"),), always(True), refuses),
     Rule("data that were left out agree better with an addition",
          REFUSED,
-         lambda real: lambda evidence, trial: real(evidence, dataclasses.replace(trial, compared=FitComparison())),
+         lambda real: lambda trial: real(dataclasses.replace(trial, compared=FitComparison())),
          _of("data that were left out")),
     Rule("no KIND contradicts an addition, nor all of them (`contradicting`)",
          ((refits, "contradicting"), (remainder, "contradicting")), always(""), answers),
@@ -144,7 +118,6 @@ RULES = (
          ((remainder, "instead_of_names"),), always(("", False)), answers),
     Rule("another reading of the data is asked (`causes_of`)", ((workflow, "causes_of"),), always(()), answers),
 )  # fmt: skip
-OF_LINEAR_STEPS = RULES[:6]
 INSTEAD = remainder.instead_of_names
 WORTH = {"right": 2, "in its class": 2, "class": 2, "open": 1, "not detected": 1, "": 1, "wrong": 0}
 
@@ -177,89 +150,6 @@ def watched(rules: tuple[Rule, ...]) -> Iterator[set[str]]:
             for owner, name in rule.watched or rule.places:
                 stack.enter_context(patch.object(owner, name, noting(getattr(owner, name), rule)))
         yield decided
-
-
-# ------------------------------------------------------------------------------------------------------ linear steps
-
-
-class Scenes:
-    """Scenes of a folder, and pairs, with the truth."""
-
-    def __init__(self, folder: Path, seed: int, each: int, quiet: int, pairs: int) -> None:
-        self.blind = Layout(seed).blind
-        with np.load(folder / "scenes.npz") as scenes:
-            self.residuals, self.without = scenes["residuals"], scenes["without"]
-        self.blind.rng = np.random.default_rng([seed, 99])
-        self.pairs = [self.blind.pair(10.0) for _ in range(pairs)]
-        self.truth: dict[int, dict[str, Any]] = {}
-        seen: Counter[tuple[str, str, float]] = Counter()
-        for number, label in enumerate(opened(folder)[0]):
-            key = label["kind"], label["name"], label["ratio"]
-            seen[key] += 1
-            if seen[key] <= (quiet if label["kind"] == "null" else each):
-                self.truth[number] = label
-        for number, pair in enumerate(self.pairs):
-            self.truth[-1 - number] = {"kind": "pair", "said": pair.truth}
-
-    def _scene(self, number: int) -> Scene:
-        if number < 0:
-            return self.pairs[-1 - number]
-        r = self.residuals[number] * STEP
-        evidence = self.blind.evidence
-        along = self.blind._whitening.T @ evidence.design.products(
-            evidence.columns, evidence.design.projector(r)
-        )
-        rest = float(r @ r - along @ along)
-        return Scene("", (), 0.0, along, rest, removed=(str(self.without[number]),))
-
-    def judged(self, number: int) -> dict[str, Any]:
-        """Verdict and additions, and what is right of them."""
-        scene = self._scene(number)
-        verdict = self.blind.judged(scene, self.blind.start(scene))[0]
-        return {
-            "kind": verdict.kind,
-            "added": list(verdict.added),
-            "outcome": _outcome(verdict, self.truth[number]),
-        }
-
-
-def _outcome(verdict: Any, truth: dict[str, Any]) -> str:
-    if verdict.kind == "consistent":
-        return "right" if truth["kind"] == "null" else "not detected"
-    told = {*verdict.named, *(text for group in verdict.added for text in group.split("; "))}
-    classes = {text for one in verdict.classes for group in one for text in group.split("; ")}
-    right = set(truth["said"])
-    if truth["kind"] == "pair":
-        return "right" if right <= told else "in its class" if right <= told | classes else "wrong"
-    if told & right:
-        return "right"
-    if classes & right:
-        return "in its class"
-    named = any(name != "described" for name in verdict.named)
-    return "open" if verdict.kind == "unexplained" and not named else "wrong"
-
-
-def ablation(scenes: Scenes) -> dict[str, tuple[int, int, int, int]]:
-    """For each rule: scenes in which it decides, changed without it, better and worse with it."""
-    before, where = {}, {rule.text: list[int]() for rule in OF_LINEAR_STEPS}
-    for scene in scenes.truth:
-        with watched(OF_LINEAR_STEPS) as decided:
-            before[scene] = scenes.judged(scene)
-        for text in decided:
-            where[text].append(scene)
-    print("with all rules", Counter(judged["outcome"] for judged in before.values()), flush=True)
-    rows = {}
-    for rule in OF_LINEAR_STEPS:
-        changed = better = worse = 0
-        with without(rule):
-            for scene in where[rule.text]:
-                now = scenes.judged(scene)
-                changed += any(now[key] != before[scene][key] for key in ("kind", "added"))
-                gain = WORTH[before[scene]["outcome"]] - WORTH[now["outcome"]]
-                better, worse = better + (gain > 0), worse + (gain < 0)
-        rows[rule.text] = len(where[rule.text]), changed, better, worse
-        print(rule.text, rows[rule.text], flush=True)
-    return rows
 
 
 # -------------------------------------------------------------------------------------------------------------- fits
@@ -442,9 +332,7 @@ def table_of_fits(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = options_of(__doc__, each=1, quiet=40, pairs=40, seed=2, first=0, budget=60.0)
-    parser.add_argument("folders", type=Path, nargs="*", metavar="OLD NEW")
-    parser.add_argument("--fits", action="store_true", help="sets of the grammar of sealed.py, fitted")
+    parser = options_of(__doc__, seed=2, first=0, budget=60.0)
     parser.add_argument("--save", type=Path, help="file of the sets so far, written after each")
     parser.add_argument("--join", type=Path, nargs="+", help="such files: print their table")
     options = parser.parse_args()
@@ -452,21 +340,7 @@ def main() -> None:
     if options.join:
         print(table_of_fits([row for file in options.join for row in pickle.loads(file.read_bytes())]))
         return
-    if options.fits:
-        print(table_of_fits(fits(options.seed, options.first, options.budget, options.save)))
-        return
-    tables, (old, new) = [], options.folders
-    for folder, seed, pairs in ((old, 1, 0), (new, options.seed, options.pairs)):
-        scenes = Scenes(folder, seed, options.each, options.quiet, pairs)
-        tables.append((len(scenes.truth), ablation(scenes)))
-    counts = " | ".join(f"of {count} scenes: decides; changed; better; worse with it" for count, _ in tables)
-    print(f"| rule | {counts} |\n| --- | --- | --- |")
-    for rule in OF_LINEAR_STEPS:
-        print(
-            f"| {rule.text} | "
-            + " | ".join("; ".join(map(str, table[rule.text])) for _, table in tables)
-            + " |"
-        )
+    print(table_of_fits(fits(options.seed, options.first, options.budget, options.save)))
 
 
 if __name__ == "__main__":

@@ -10,10 +10,9 @@ Separation    The change D of the residuals that a candidate makes at its amplit
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -24,7 +23,7 @@ from scipy import special
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import GAIN, SINGLE_EXPOSURES, Design, number_of_columns, strata
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates, sentences_of
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates
 from walop_jax.diagnosis.score import (
     Candidate,
     Matrix,
@@ -54,22 +53,10 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
         if not alive:
             continue
         alive.sort(key=lambda item: -item[1].log_bayes)
-        (probe, score), best = alive[0], alive[0][1].log_bayes
+        probe, score = alive[0]
         mean = float(np.logaddexp.reduce([s.log_bayes for _, s in alive]) - np.log(len(shapes)))
-        least = best - max(thresholds.WITHIN, 0.2 * best)
-        alternatives = [item for item in alive[1 : thresholds.MOST_FITTED] if item[1].log_bayes > least]
-        ranked.append(Ranked(probe, score, mean, tuple(alternatives)))
+        ranked.append(Ranked(probe, score, mean))
     return sorted(ranked, key=lambda item: -item.log_bayes)
-
-
-def leaders(ranked: Sequence[Ranked]) -> list[Ranked]:
-    """Candidates with a linear evidence close to the best."""
-    if not ranked:
-        return []
-    best, reach = ranked[0].log_bayes, thresholds.WITHIN
-    if best > thresholds.LINEAR_BELOW:
-        reach = max(reach, thresholds.LINEAR_SHARE * best)
-    return [item for item in ranked[: thresholds.MOST_LEADERS] if item.log_bayes > best - reach]
 
 
 def follow_physics(probe: Probe, amplitudes: Vector, covariance: Matrix) -> bool:
@@ -142,6 +129,11 @@ class Evidence:
         candidates = (Ranked(p, s, s.log_bayes - price) for p, s in scored if s.testable)
         return sorted(candidates, key=lambda item: -item.log_bayes)
 
+    @cached_property
+    def by_name(self) -> Mapping[str, Ranked]:
+        """Effects and sentences by name."""
+        return {item.name: item for item in (*self.ranked, *self.ranked_sentences)}
+
     def is_clear(self, score: Score) -> bool:
         """True if a candidate is significant by itself, after correction for all."""
         return self.table.corrected(score) < thresholds.ALARM
@@ -175,26 +167,9 @@ class Evidence:
         """
         return self.table.noise_scale if self.table.noise_scale > thresholds.FLOOR else 1.0
 
-    @cached_property
-    def _pattern_scores(self) -> list[Score]:
-        return [score for score in map(self.table.__getitem__, self.patterns) if score.testable]
-
-    @cached_property
-    def evidence_needed(self) -> float:
-        """Evidence that a name needs: where the base is excluded it competes with patterns that have none."""
-        return min(0.0, max((s.log_bayes for s in self._pattern_scores), default=0.0))
-
     def by_fit(self, score: Score) -> float:
         """Difference of the evidence that a fit finds, with its errors, from that in units of the remaining noise."""
         return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
-
-    def best_pattern(self, *, fitted: bool = False) -> float:
-        """Evidence of the most probable pattern, less the logarithm of the number of patterns.
-
-        In the unit of linear trials, or as a fit of it would find it (`by_fit`).
-        """
-        alive = [score.log_bayes + fitted * self.by_fit(score) for score in self._pattern_scores]
-        return max(alive, default=-np.inf) - float(np.log(max(len(alive), 1)))
 
     @cached_property
     def beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
@@ -218,18 +193,6 @@ class Evidence:
             table = space.table_after(self.table, scores)
         return needed, table
 
-    def stands(self, effect: EffectKind, evidence: float, fitted: bool) -> bool:
-        """True if no pattern without a name is clearly more probable than an effect with this evidence.
-
-        It stands as well if it is significant beside the patterns that are needed, or has no linear step.
-        """
-        probes = [probe for probe in self.probes if probe.effect is effect]
-        if not probes and effect is not Described:
-            return True
-        if evidence > self.best_pattern(fitted=fitted) - thresholds.EVEN_ODDS:
-            return True
-        return any(self.is_clear(self.beside_patterns[1][probe.name]) for probe in probes)
-
     # ------------------------------------------------------------------------------- indistinguishable candidates
 
     def apart(self, item: Ranked) -> dict[str, float]:
@@ -248,32 +211,6 @@ class Evidence:
         apart.pop(item.effect.name, None)
         close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
         return tuple(sorted(close, key=close.__getitem__))
-
-    def nameless(self, item: Ranked, own: Collection[str] = ()) -> tuple[str, ...]:
-        """Sentences beside a candidate that are not improbable, or no longer and indistinguishable from it.
-
-        The most probable come first; `own` are its equivalent sentences.
-        """
-        least, apart = max(0.0, item.log_bayes - thresholds.IMPROBABLE), self.apart(item)
-        length, limit = len(item.score.amplitudes), thresholds.SEPARATION * self.floor
-        alike = {p.name for p in self.sentences if len(p.widths) <= length and apart[p.name] < limit}
-        rivals = (r for r in self.ranked_sentences if r.log_bayes > least or r.probe.name in alike)
-        others = (r.probe for r in rivals if r.probe is not item.probe)
-        names = [probe.name for probe in others if not set(own) & set(sentences_of(probe))]
-        return tuple(names[: thresholds.MOST_CLASSES])
-
-    def held_in_part(self, item: Ranked) -> tuple[str, ...]:
-        """Effects of which a part, by itself, is not improbable beside a candidate; parts share the prior of theirs."""
-        count = collections.Counter(effect for probe in self.parts for effect in probe.holders)
-        least = max(0.0, item.log_bayes - thresholds.IMPROBABLE)
-        scored = ((self.table[probe.name], effect) for probe in self.parts for effect in probe.holders)
-        likely = (
-            effect.name
-            for score, effect in scored
-            if effect is not item.effect and score.testable
-            if score.log_bayes - float(np.log(count[effect])) > least
-        )
-        return tuple(dict.fromkeys(likely))
 
     def classes(self) -> Iterator[dict[str, Any]]:
         """Rows of a file: effects indistinguishable from each significant one, by linear steps."""

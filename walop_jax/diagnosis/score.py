@@ -516,12 +516,14 @@ def log_bayes(gram: Matrix, scores: Vector, widths: Vector, scales: Vector = SCA
     return float(np.logaddexp.reduce(log_factors) - np.log(len(log_factors)))
 
 
-def log_bayes_by_scale(value: Vector, s: Vector, scales: Vector) -> Vector:
+def log_bayes_by_scale(
+    value: Float[np.ndarray, "*n k"], s: Float[np.ndarray, "*n k"], scales: Float[np.ndarray, " t"]
+) -> Float[np.ndarray, "*n t"]:
     """ln B at each scale t, of numbers whose Gram matrix is diagonal: `value` and scores `s` in prior widths."""
     t = scales[:, None] ** 2
     # None is below 0: rounding of columns that are nearly alike must not make it so.
-    value = t * np.clip(value, 0.0, None)
-    return 0.5 * np.sum(t * s**2 / (1.0 + value) - np.log1p(value), axis=1)
+    value = t * np.clip(value, 0.0, None)[..., None, :]
+    return 0.5 * np.sum(t * s[..., None, :] ** 2 / (1.0 + value) - np.log1p(value), axis=-1)
 
 
 def _log_of_chi2(statistic: Any, rank: int) -> Any:

@@ -1,32 +1,31 @@
-"""The search for missing effects: while one is missing, additions are tried, refused with a reason, or adopted.
+"""The search for missing effects: while something is missing, the most probable name of it is fitted and added.
 
-All is functions of a `State`, which never changes. `refused` has all rules by which an addition is not made, `search`
-is the loop. What differs between the search that fits (`refits.Refits`) and the one of the blind study, which takes
-linear steps (`tests/diagnosis/linear_judge.py`), is a `Judge`.
-
-1. Candidates are ordered by their linear evidence: names, and descriptions that are more probable than every name that
-   is not refused. Candidates that their linear step would refuse are not tried.
-2. The best is fitted. If it leaves nothing but noise, no rival can be better. If its evidence differs from that of its
-   linear step by more than `thresholds.LINEAR_GOOD`, rivals that lie within twice the difference are fitted as well.
+1. `selection` says how many things are missing, and which names each of them may have, by linear steps from the fit.
+2. The names of the most certain thing are fitted, the most probable first, until one of them is, with what its fit
+   found beyond the linear step, more probable than every name that was not fitted.
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
-   competes with the names: structural effects and other descriptions of the instrument (`descriptions`).
-4. The best that data which took no part in its fit confirm is adopted, and the residuals are scored again.
+   competes with the names: structural effects and other descriptions of the instrument (`Refits.others`).
+4. The most probable that data which took no part in its fit confirm joins the model, and the residuals are scored
+   again. Of a thing none of whose names is confirmed the next one is asked.
+
+All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `Judge` says
+what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps (`tests/diagnosis/linear_judge.py`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.exact import Trial, beyond_prior, in_words
-from walop_jax.diagnosis.examination import Evidence, explains, leaders
+from walop_jax.diagnosis.exact import Trial, beyond_prior
+from walop_jax.diagnosis.examination import Evidence, explains
 from walop_jax.diagnosis.findings import Choice, descriptions_of
 from walop_jax.diagnosis.hypotheses import Ranked
-from walop_jax.io.text import beside
+from walop_jax.diagnosis.selection import Posterior, Thing, most_probable
 from walop_jax.model.effects import Described
 
 MOST_LISTED = 40
@@ -74,7 +73,7 @@ class State:
 
 
 Judge = Any
-"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone (the blind study):
+"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone:
 
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
 fitted      a linear trial as the judge finds it
@@ -98,28 +97,14 @@ def search(state: State, judge: Judge) -> State:
     return state
 
 
-def refused(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to add the effect of a trial; empty: there is none."""
-    if trial.fit is not None and not trial.fit.converged:
-        return "its fit did not converge"
+def against(trial: Trial) -> str:
+    """Reason not to add the name of a trial; empty: there is none."""
     if not trial.predicts:
         return "by its linear step it does not predict settings and field points that it has not seen"
-    # Linear evidence counts in the scatter behind all candidates already, that of fits in their errors.
-    fitted, needed = trial.fit is not None, evidence.evidence_needed
-    worth = trial.evidence / evidence.floor**2 if fitted else trial.evidence
-    if worth <= needed:
-        found, limit = beside(worth, needed, ".{}g")
-        return f"ln B = {found} is not above {limit}"
-    explained, least = evidence.chi2 - trial.left, _least_explained(evidence, trial)
-    if explained < least:
-        missing = evidence.chi2 - evidence.dof
-        found, limit = beside(explained, least, ".{}g")
-        return f"it explains {found} of {missing:.4g} that are missing in χ², less than {limit}"
-    # The residuals are noise now: a pattern can only describe the same with more numbers.
-    suffices = trial.noise and not explains(evidence.chi2, evidence.dof)
-    if not suffices and not evidence.stands(trial.effect, trial.evidence, fitted):
-        best = evidence.best_pattern(fitted=fitted)
-        return f"a pattern without a name is more probable (ln B = {best:.3g}, its own {trial.evidence:.3g})"
+    if trial.fit is not None and not trial.fit.converged:
+        return "its fit did not converge"
+    if trial.evidence <= 0.0:
+        return f"ln B = {trial.evidence:.3g} is not above 0: the model is more probable without it"
     if trial.fit is not None and (far := _far_beyond(trial)):
         return far
     before, after = trial.compared.heldout_before, trial.compared.heldout_after
@@ -148,24 +133,6 @@ def _far_beyond(trial: Trial) -> str:
     return f"{name} is {beyond[name]:.0f} widths of its prior, more than {thresholds.MOST_WIDTHS:g}: no explanation"
 
 
-def _least_explained(evidence: Evidence, trial: Trial) -> float:
-    """Part of the excess of χ² that an addition must explain."""
-    # Of a poor fit the final model is asked (`thresholds.PART`): its misfit may have many causes.
-    if evidence.poor or trial.effect is Described:
-        return 0.0
-    surely = evidence.chi2 - evidence.dof - 2.0 * np.sqrt(2.0 * evidence.dof)
-    return thresholds.LEAST_SHARE_OF_NAME * surely
-
-
-def hopeless(evidence: Evidence, trial: Trial) -> str:
-    """Reason not to try an effect that is refused even if it is better by the error of linear steps."""
-    if trial.evidence <= thresholds.LINEAR_BELOW:
-        return refused(evidence, trial)
-    factor = 1.0 + thresholds.LINEAR_SHARE
-    remaining = evidence.chi2 - factor * (evidence.chi2 - trial.left)
-    return refused(evidence, dataclasses.replace(trial, evidence=factor * trial.evidence, left=remaining))
-
-
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
@@ -175,119 +142,166 @@ def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
     return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, linear=linear)
 
 
-def _by_evidence(trial: Trial) -> float:
-    return -trial.evidence
+# ------------------------------------------------------------------------------------------------------- one round
 
 
-@dataclasses.dataclass(frozen=True)
-class _Log:
-    """The trials of one round by name, each with the reason for which it was refused."""
+Probable = tuple[float, Trial]
+"""A trial with the logarithm of its probability among the names of its thing."""
 
-    evidence: Evidence
+
+@dataclasses.dataclass
+class _Turn:
+    """One round as it goes on: its trials by name, with what speaks against each, and what it has cost.
+
+    `fits` and `choices` begin as those of the state.
+    """
+
+    state: State
+    judge: Judge
+    posterior: Posterior
+    fits: int
+    choices: Mapping[str, Choice]
     trials: dict[str, Trial] = dataclasses.field(default_factory=dict)
+    others_asked: bool = False
 
-    def sentences(self, names: Iterable[Trial]) -> list[Trial]:
-        """The leading sentences that are more probable than names and have not been tried; a few of a round."""
-        least = max((name.item.log_bayes for name in names if name.item is not None), default=-np.inf)
-        count = sum(trial.effect is Described for trial in self.trials.values())
-        most = min(thresholds.MOST_SENTENCES, 2 * thresholds.MOST_SENTENCES - count)
-        untried = (item for item in self.evidence.significant_sentences if item.name not in self.trials)
-        probable = [item for item in untried if item.log_bayes > least]
-        return self.passed((linear_trial(self.evidence, item) for item in probable[:most]), hopeless)
+    @classmethod
+    def of(cls, state: State, judge: Judge) -> _Turn:
+        """The round of a state, in which nothing has been tried."""
+        return cls(state, judge, most_probable(state.evidence), state.fits, state.choices)
 
-    def passed(self, trials: Iterable[Trial], why: Callable[[Evidence, Trial], str]) -> list[Trial]:
-        """The trials that are not refused; all are noted."""
-        judged = [dataclasses.replace(trial, refused=why(self.evidence, trial)) for trial in trials]
-        self.trials.update((trial.name, trial) for trial in judged)
-        return [trial for trial in judged if not trial.refused]
+    @property
+    def evidence(self) -> Evidence:
+        """The evidence of the current model."""
+        return self.state.evidence
+
+    def passes(self, trial: Trial) -> bool:
+        """Whether nothing speaks against a trial; it is noted in any case."""
+        self.trials[trial.name] = dataclasses.replace(trial, refused=against(trial))
+        return not self.trials[trial.name].refused
+
+    def names_of(self, thing: Thing) -> list[Probable]:
+        """The names of a thing that nothing speaks against, as they were fitted.
+
+        Names outside of the set of the thing are fitted only where the fits of those in it have found them less
+        probable than their linear steps said.
+        """
+        passed = list[Probable]()
+        for name, probability in thing.probabilities.items():
+            if not passed and name not in thing.names:
+                break
+            item = _candidate(self.evidence, name, thing)
+            if item is None or item.name in self.trials:
+                continue
+            expected = float(np.log(max(probability, 1e-300)))
+            settled = any(trial.noise or worth >= expected for worth, trial in passed)
+            if settled or self.judge.over(self.fits):
+                break
+            self.fits += 1
+            trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
+            if self.passes(trial):
+                beyond = (trial.evidence - trial.linear) / self.evidence.floor**2
+                passed.append((expected + beyond, trial))
+        return passed
+
+    def explains(self, trial: Trial) -> bool:
+        """Whether a trial explains so much that what has no linear step need not be asked."""
+        missing = self.evidence.chi2 - self.evidence.dof
+        return trial.noise or self.evidence.chi2 - trial.left > thresholds.GOOD_SHARE * missing
+
+    def others(self, names: Sequence[Probable]) -> list[Probable]:
+        """What has no linear step, once in a round; compared with names by the evidence of the fits of both."""
+        if self.others_asked:
+            return []
+        self.others_asked = True
+        trials, self.choices = self.judge.others(dataclasses.replace(self.state, fits=self.fits))
+        self.fits += len(trials)
+        unit = self.evidence.floor**2
+        best = max(names, key=lambda pair: pair[1].evidence, default=None)
+        level = 0.0 if best is None else best[0] - best[1].evidence / unit
+        return [(level + trial.evidence / unit, trial) for trial in trials if self.passes(trial)]
+
+    def confirmed(self, passed: Iterable[Probable]) -> Trial | None:
+        """The most probable trial that data which took no part in its fit confirm; None: there is none."""
+        for _, trial in sorted(passed, key=lambda pair: -pair[0]):
+            confronted = self.judge.confronted(self.evidence, trial)
+            if self.passes(confronted):
+                return confronted
+        return None
+
+    def reasons(self, added: str) -> Iterator[Reason]:
+        """Everything that was tried, and the leading candidates that were only scored, with the reasons."""
+        table = self.evidence.table
+        for name, trial in self.trials.items():
+            first = (
+                f"{added} was added first" if added else "the search was broken off before it was its turn"
+            )
+            reason = trial.refused or ("" if name == added else first)
+            p = table.p_global if trial.item is None else table.corrected(trial.item.score)
+            yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
+        for ranked in (self.evidence.significant, self.evidence.significant_sentences):
+            for item in ranked[:MOST_LISTED]:
+                if item.name not in self.trials:
+                    p = table.corrected(item.score)
+                    yield Reason(item.name, item.log_bayes, p, False, self._less_probable(item.name))
+
+    def _less_probable(self, name: str) -> str:
+        """What is more probable than a name that was not tried, in words."""
+        things = [thing for thing in self.posterior.things if name in thing.probabilities]
+        if not things:
+            return f"nothing more is missing with a probability of {self.posterior.nothing_more:.2g}"
+        thing = max(things, key=lambda thing: thing.probabilities[name])
+        if thing.is_pattern:
+            return f"a pattern without a name is more probable ({thing.candidate})"
+        best = next(iter(thing.probabilities))
+        if best == name:
+            return "the search was broken off before it was its turn"
+        probability = thing.probabilities[name]
+        return f"{best} is more probable: {thing.probabilities[best]:.2g}, and this {probability:.1g}"
 
 
 def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
-    """The addition with the highest evidence that is not refused (None: all are), and the state with the reasons."""
-    evidence, log, fits, choices = state.evidence, _Log(state.evidence), state.fits, state.choices
-    waiting = log.passed((linear_trial(evidence, item) for item in leaders(evidence.significant)), hopeless)
-    tried, accepted, others_asked, ended = list(waiting), None, False, ""
-    while accepted is None:
-        passed: list[Trial] = []
-        while not (ended := judge.over(fits)):
-            # Where names are refused, descriptions were behind them that are more probable than those that remain.
-            more = log.sentences(trial for trial in (*passed, *waiting) if trial.effect is not Described)
-            tried, waiting = [*tried, *more], sorted([*waiting, *more], key=_by_evidence)
-            if not waiting:
-                break
-            linear, fits = waiting.pop(0), fits + 1
-            if fitted := log.passed([judge.fitted(evidence, linear)], refused):
-                passed += fitted
-                tried = [fitted[0] if candidate is linear else candidate for candidate in tried]
-                if _is_sure(fitted[0], waiting):
-                    break
-        missing = evidence.chi2 - evidence.dof
-        explained = any(t.noise or evidence.chi2 - t.left > thresholds.GOOD_SHARE * missing for t in passed)
-        if not others_asked and not explained and (evidence.poor or not passed):
-            others_asked = True
-            alternatives, choices = judge.others(dataclasses.replace(state, fits=fits))
-            fits += len(alternatives)
-            alternatives = log.passed(alternatives, refused)
-            passed, tried = [*passed, *alternatives], [*tried, *alternatives]
-        for trial in sorted(passed, key=_by_evidence):
-            if accepted := next(iter(log.passed([judge.confronted(evidence, trial)], refused)), None):
-                break
-        if not waiting or (ended := judge.over(fits)):
+    """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
+    turn, accepted = _Turn.of(state, judge), None
+    named = (thing for thing in turn.posterior.things if not thing.is_pattern)
+    for thing in [*sorted(named, key=lambda thing: -thing.certainty), None]:
+        passed = [] if thing is None else turn.names_of(thing)
+        if (state.evidence.poor or thing is None) and not any(turn.explains(trial) for _, trial in passed):
+            passed += turn.others(passed)
+        accepted = turn.confirmed(passed)
+        if accepted is not None:
+            accepted = _with_rivals(state.evidence, accepted, thing, passed)
             break
-    if accepted is not None:
-        ended, accepted = "", _with_rivals(evidence, accepted, tried)
+        if judge.over(turn.fits):
+            break
     added = "" if accepted is None else accepted.name
-    turn = Round(evidence.table.p_global, added, tuple(_asked(evidence, log.trials, added)))
-    rounds = (*state.rounds, turn)
-    return accepted, dataclasses.replace(state, rounds=rounds, choices=choices, fits=fits, ended=ended)
+    rounds = (*state.rounds, Round(state.evidence.table.p_global, added, tuple(turn.reasons(added))))
+    ended = judge.over(turn.fits) if accepted is None else ""
+    return accepted, dataclasses.replace(
+        state, rounds=rounds, choices=turn.choices, fits=turn.fits, ended=ended
+    )
 
 
-def _is_sure(trial: Trial, waiting: Sequence[Trial]) -> bool:
-    """True if no trial that waits can be better: this one leaves noise, or agrees with its linear step."""
-    error = abs(trial.evidence - trial.linear)
-    reach = 2.0 * error if error > thresholds.LINEAR_GOOD else 0.0
-    return trial.noise or not waiting or trial.linear - waiting[0].linear >= reach
+def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
+    """The candidate of a name, with the shapes that it may have as this thing; None where it cannot be fitted."""
+    item = evidence.by_name.get(name)
+    shapes = [p for p in thing.shapes.get(name, ()) if item is not None and p.effect is item.effect]
+    if item is None or not shapes:
+        return item
+    scored = [(probe, evidence.table[probe.name]) for probe in shapes[: thresholds.MOST_FITTED]]
+    (probe, score), *others = scored
+    return dataclasses.replace(item, probe=probe, score=score, others=tuple(others))
 
 
-def _with_rivals(evidence: Evidence, trial: Trial, tried: Sequence[Trial]) -> Trial:
-    """A trial with the alternatives that are not improbable, and other shapes of its effect that are as probable."""
-    rivals, shapes = [], list(trial.alternatives)
-    for rival in tried:
-        if rival.name == trial.name:
-            continue
-        linear = rival.fit is None and not np.isnan(trial.linear)
-        apart = abs(rival.linear - trial.linear if linear else rival.evidence - trial.evidence)
-        if rival.effect is not trial.effect and apart < thresholds.IMPROBABLE:
-            rivals.append(rival.effect.name)
-        elif rival.effect is trial.effect and rival.fit is not None and apart < thresholds.EVEN_ODDS:
-            shapes.append(in_words(rival.instance))
-    item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
-    nameless = () if item is None else evidence.nameless(item, trial.sentences)
-    rivals += () if item is None else evidence.held_in_part(item)
-    others = tuple(dict.fromkeys(rivals))
-    named = {trial.name: "" if item is None else item.probe.name, **{name: name for name in nameless}}
-    also = {name: evidence.also[probe] for name, probe in named.items() if probe in evidence.also}
-    return dataclasses.replace(trial, alternatives=tuple(shapes), rivals=others, nameless=nameless, also=also)
-
-
-def _asked(evidence: Evidence, trials: Mapping[str, Trial], added: str) -> Iterable[Reason]:
-    """Everything that was tried in a round, and the leading candidates that were only ranked, with the reasons."""
-    table = evidence.table
-    for name, trial in trials.items():
-        first = f"{added} was added first" if added else "the search was broken off before it was its turn"
-        reason = trial.refused or ("" if name == added else first)
-        p = table.p_global if trial.item is None else table.corrected(trial.item.score)
-        yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
-    for ranked in (evidence.significant, evidence.significant_sentences):
-        for item in ranked[:MOST_LISTED]:
-            if item.name not in trials:
-                reason = _too_far(evidence, item)
-                yield Reason(item.name, item.log_bayes, table.corrected(item.score), False, reason)
-
-
-def _too_far(evidence: Evidence, item: Ranked) -> str:
-    """Reason for which a significant candidate was not tried: the candidates before it."""
-    leading = *evidence.significant[:1], *evidence.significant_sentences[:1]
-    best = max(leading, key=lambda ranked: ranked.log_bayes)
-    gap = best.log_bayes - item.log_bayes
-    return f"{best.name} is more probable, by {gap:.3g} in ln B" if gap > 0.0 else "others were tried first"
+def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: Iterable[Probable]) -> Trial:
+    """A trial with the other names of the thing that it is: those of its set, and those that fits find as probable."""
+    worth = {other.name: probable for probable, other in passed}
+    near = [name for name, value in worth.items() if value > worth[trial.name] - thresholds.IMPROBABLE]
+    in_set = thing.names if thing is not None and trial.item is not None else ()
+    own = trial.name, trial.effect.name
+    names = [name for name in dict.fromkeys([*in_set, *near]) if name not in own]
+    effects = {item.effect.name for item in evidence.ranked}
+    nameless = tuple(name for name in names if name not in effects)[: thresholds.MOST_CLASSES]
+    rivals = tuple(name for name in names if name in effects)
+    probes = {trial.name: "" if trial.item is None else trial.item.probe.name} | {n: n for n in nameless}
+    also = {name: evidence.also[probe] for name, probe in probes.items() if probe in evidence.also}
+    return dataclasses.replace(trial, rivals=rivals, nameless=nameless, also=also)

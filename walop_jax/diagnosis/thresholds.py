@@ -11,27 +11,24 @@ from __future__ import annotations
 ALARM = 0.0027  # global p below which something is missing, and corrected p below which a candidate is significant: 3 σ
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 
-# Which candidates are tried?
+# What is missing, and which candidate it is (`selection`)?
 
-MOST_STEPS = 6  # additions of one diagnosis
-MOST_LEADERS = 5  # names that are tried at one step
-# Descriptions that one step tries. More, or more names, in the final model can be one thing that none of them holds.
+NOTHING_MORE = 0.5  # ν, probability beforehand that nothing more is missing
+# λ, probability that something is missing from which on it is called, and with which a set of names holds its thing.
+CERTAIN = 0.95
+MOST_STEPS = 6  # things that are missing at once; additions of one diagnosis
+# Descriptions of the final model above which they can be one thing that none of them holds.
 MOST_SENTENCES = 2
 MOST_TOGETHER = 4  # numbers of one thing that are tried together: members of a group of descriptions, priors
 MOST_FITTED = 4  # shapes of one effect from which it is fitted; other descriptions that are fitted
-WITHIN = 8.0  # evidence below the best within which a rival is tried
-LINEAR_GOOD = 1.0  # evidence by which a fit may differ from its linear trial before rivals are fitted as well
+LINEAR_GOOD = 1.0  # evidence by which members of a class that were fitted may differ from their linear steps
 SAME_COUNTS = 0.01  # relative change of the counts up to which columns of an earlier model serve again
 POOR_FIT = 1.5  # χ²/dof above which structural effects and other descriptions are tried
 GOOD_SHARE = 0.5  # share of the misfit that a name must explain for these not to be tried
-LINEAR_BELOW = 150.0  # evidence of the best above which rivals are tried down to `LINEAR_SHARE` of it less
-LINEAR_SHARE = 0.6  # by which a fit may be better than its linear step there
 FLOOR = 1.25  # σ of the residuals behind all candidates above which evidence counts in that unit
 
 # Additions
 
-# Of what is surely missing (2 σ of χ²) a name, where the fit is not poor: else it stands in for what has none.
-LEAST_SHARE_OF_NAME = 0.25
 # Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added; and
 # by which another reading of the data must, to be reported.
 PART = 10.0

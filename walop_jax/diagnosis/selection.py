@@ -1,7 +1,5 @@
 """What is missing, and which candidate it is: the most probable set of things, by exact evidence of linear steps.
 
-A rival of the search that `diagnose` makes, which `one_law.py` compares with it.
-
 One fit leaves residuals. A *thing* is one cause of what they show; a *candidate* is one way to say it: a shape of an
 effect of the catalogue, a description, a part of an effect, a pattern without a name. "A ghost, and a camera that is
 not linear" are two things; for the first of them "ghost" and four descriptions of added light may be candidates.
@@ -46,14 +44,12 @@ from scipy import special
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.score import SCALES, Vector
+from walop_jax.diagnosis.score import SCALES, Vector, log_bayes_by_scale
 from walop_jax.model.effects import Described
 
-NOTHING_MORE = 0.5  # ν, probability beforehand that nothing more is missing
-# λ, probability that something is missing from which on it is called, and with which a set of names holds its thing.
-CERTAIN = 0.95
-MOST_THINGS = 6  # of one set
-MOST_EXCHANGES = 10  # rounds of exchanges after one addition
+MOST_EXCHANGES = (
+    10  # rounds of exchanges after one addition: they end by themselves, but for candidates that are equal
+)
 
 Member = tuple[int, float]
 """A candidate by its position, and the scale t of the prior of its amplitudes."""
@@ -66,7 +62,7 @@ class Thing:
     `candidate` is the probe, or the name of the pattern, with the largest posterior probability; `log_evidence` is its
     ln B beside the other things, in units of the scatter behind all candidates. `probabilities` are those of all names
     of effects and of all descriptions, the most probable first; `equal` the same, were all of them equally probable
-    beforehand. `shapes` are the probes that each name of the set may mean, down to the `CERTAIN` part of its
+    beforehand. `shapes` are the probes that each name of the set may mean, down to the `thresholds.CERTAIN` part of its
     probability.
     """
 
@@ -82,8 +78,13 @@ class Thing:
         return isinstance(self.candidate, str)
 
     @property
+    def certainty(self) -> float:
+        """Probability of its most probable name."""
+        return next(iter(self.probabilities.values()), 0.0)
+
+    @property
     def names(self) -> tuple[str, ...]:
-        """The set of the thing: names that hold it with the probability `CERTAIN`, by either prior."""
+        """The set of the thing: names that hold it with the probability `thresholds.CERTAIN`, by either prior."""
         return tuple(dict.fromkeys([*_shortest(self.probabilities), *_shortest(self.equal)]))
 
 
@@ -103,7 +104,7 @@ class Posterior:
         nameless = [t for t in self.things if isinstance(t.candidate, Probe) and _is_nameless(t.candidate)]
         patterns = any(thing.is_pattern for thing in self.things)
         few = len(nameless) <= thresholds.MOST_SENTENCES
-        return self.nothing_more > 1.0 - CERTAIN and not patterns and few
+        return self.nothing_more > 1.0 - thresholds.CERTAIN and not patterns and few
 
 
 def most_probable(evidence: Evidence) -> Posterior:
@@ -167,11 +168,11 @@ class Candidates:
                 value, vector = np.linalg.eigh(left)
             value = np.clip(value, 0.0, None)
             turned = np.einsum("nij,ni->nj", vector, scores[at])
-            for number, scale in enumerate(SCALES[: 1 if at.shape[1] == 1 else None]):
-                spread = scale**2 / (1.0 + scale**2 * value)
-                bayes = 0.5 * np.sum(spread * turned**2 - np.log1p(scale**2 * value), axis=1)
-                bayes += self._on_its_side(self.one_sided[at], vector, spread, turned)
-                found[chosen, number] = bayes
+            scales = SCALES[: 1 if at.shape[1] == 1 else None]
+            found[chosen, : len(scales)] = log_bayes_by_scale(value, turned, scales)
+            if (one_sided := self.one_sided[at]).any():
+                spread = scales[:, None] ** 2 / (1.0 + scales[:, None] ** 2 * value[:, None])
+                found[chosen, : len(scales)] += _on_its_side(one_sided, vector, spread, turned)
         return found
 
     def _taken_up(self, members: Sequence[Member]) -> tuple[Float[np.ndarray, "a m"], Vector]:
@@ -187,23 +188,6 @@ class Candidates:
         root = np.linalg.cholesky(products[at] * scale[:, None] + np.eye(len(at)))
         return np.linalg.solve(root, products.T).T, np.linalg.solve(root, scale * self.scores[at])
 
-    @staticmethod
-    def _on_its_side(
-        one_sided: Bool[np.ndarray, "n k"],
-        vector: Float[np.ndarray, "n k k"],
-        spread: Float[np.ndarray, "n k"],
-        turned: Float[np.ndarray, "n k"],
-    ) -> Vector:
-        """ln of the probability that one-sided amplitudes are above 0, by data and prior against the prior alone.
-
-        Exact for one amplitude; of several each is taken by itself.
-        """
-        if not one_sided.any():
-            return np.zeros(len(one_sided))
-        mean = -np.einsum("nij,nj->ni", vector, spread * turned)
-        sigma = np.sqrt(np.einsum("nij,nj->ni", vector**2, spread))
-        return np.sum(np.where(one_sided, np.log(2.0) + special.log_ndtr(mean / sigma), 0.0), axis=1)
-
     def over_scales(self, found: Float[np.ndarray, "n t"]) -> Vector:
         """ln B of every candidate, averaged over the scales."""
         return np.logaddexp.reduce(found, axis=1) - np.log(self.scales_of)
@@ -214,12 +198,12 @@ class Candidates:
         """The most probable set of things, one added after the other, with exchanges."""
         members, odds = (
             list[Member](),
-            float(np.log(1.0 - NOTHING_MORE) - np.log(NOTHING_MORE)),
+            float(np.log(1.0 - thresholds.NOTHING_MORE) - np.log(thresholds.NOTHING_MORE)),
         )
         while True:
             best, total = self._best(members)
             nothing_more = float(special.expit(-(total + odds)))
-            if nothing_more > 1.0 - CERTAIN or len(members) == MOST_THINGS:
+            if nothing_more > 1.0 - thresholds.CERTAIN or len(members) == thresholds.MOST_STEPS:
                 break
             members = self._exchanged([*members, best], odds)
         return Posterior(tuple(self._things(members)), nothing_more)
@@ -285,6 +269,23 @@ class Candidates:
         return by_prior, equal, shapes
 
 
+def _on_its_side(
+    one_sided: Bool[np.ndarray, "n k"],
+    vector: Float[np.ndarray, "n k k"],
+    spread: Float[np.ndarray, "n t k"],
+    turned: Float[np.ndarray, "n k"],
+) -> Float[np.ndarray, "n t"]:
+    """ln of the probability that one-sided amplitudes are above 0, by data and prior against the prior alone.
+
+    Exact for one amplitude; of several each is taken by itself. `spread` are the variances of the amplitudes along the
+    columns of `vector`, `turned` the scores there.
+    """
+    mean = -np.einsum("nij,ntj,nj->nti", vector, spread, turned)
+    sigma = np.sqrt(np.einsum("nij,ntj->nti", vector**2, spread))
+    above = np.log(2.0) + special.log_ndtr(mean / sigma)
+    return np.sum(np.where(one_sided[:, None], above, 0.0), axis=2)
+
+
 def _log_sum(logs: Iterable[float]) -> float:
     return float(np.logaddexp.reduce([*logs, -np.inf]))
 
@@ -298,9 +299,9 @@ def _normalised(logs: Mapping[str, float]) -> dict[str, float]:
 
 
 def _shortest(probabilities: Mapping[str, float]) -> tuple[str, ...]:
-    """The shortest list that holds `CERTAIN`; the most probable come first already."""
+    """The shortest list that holds `thresholds.CERTAIN`; the most probable come first already."""
     held = np.cumsum(list(probabilities.values()))
-    return tuple(probabilities)[: int(np.searchsorted(held, CERTAIN)) + 1]
+    return tuple(probabilities)[: int(np.searchsorted(held, thresholds.CERTAIN)) + 1]
 
 
 def _is_nameless(probe: Probe) -> bool:

@@ -6,11 +6,12 @@ import itertools
 import numpy as np
 import pytest
 from scipy import stats
-from studies.selection import CERTAIN, Candidates, most_probable
 
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import SCALES, Projector, ScoreSpace
+from walop_jax.diagnosis.selection import Candidates, most_probable
+from walop_jax.diagnosis.thresholds import CERTAIN
 from walop_jax.model.effects import Context, Described, effect_by_name
 
 ROWS = 60
