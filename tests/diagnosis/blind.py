@@ -22,7 +22,6 @@ import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -190,8 +189,7 @@ def outside(measured: Measured, said: dict[str, np.ndarray]) -> Iterator[tuple[s
 
 def with_all_names(result: FitResult, hypotheses: Hypotheses, rng: np.random.Generator) -> Examination:
     """The examination in which synonyms are candidates of their own: each is hidden, and asked for, by its own name."""
-    nothing = SimpleNamespace(also={}, is_like=lambda design: False)
-    return examine(result, hypotheses, rng, nothing)  # type: ignore[arg-type]
+    return examine(result, hypotheses, rng, synonyms_apart=True)
 
 
 class Blind:
@@ -213,8 +211,9 @@ class Blind:
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space = examination.bare
         self.places = self.space.places()
-        self._whitening = whitening(self.space.gram)
-        self._root = self.space.gram @ self._whitening
+        gram = np.asarray(self.space.gram)
+        self._whitening = whitening(gram)
+        self._root = gram @ self._whitening
         self.dimension = self._root.shape[1]
         self.outside = {}
         self.said = {
@@ -340,7 +339,10 @@ class Blind:
 
 
 def judged(evidence: Evidence) -> Verdict:
-    """What is told of the scores of one fit: the things of the most probable set, and whether they are all of it."""
+    """What is told of the scores of one fit: the things of the most probable set, and whether they are all of it.
+
+    As in a diagnosis, names that the data cannot distinguish from that of a thing are in its class.
+    """
     if not evidence.alarm:
         return Verdict("consistent", (), ())
     posterior = most_probable(evidence)
@@ -350,7 +352,11 @@ def judged(evidence: Evidence) -> Verdict:
     verdict = Verdict(
         kind="effect_found" if named and posterior.explains else "unexplained",
         named=tuple(name if name in effects else Described.name for name in first),
-        classes=tuple(frozenset(t.names) - {name} for t, name in zip(named, first, strict=True)),
+        classes=tuple(
+            frozenset({*thing.names, *(evidence.close(item) if item else ())}) - {name}
+            for thing, name in zip(named, first, strict=True)
+            for item in [evidence.by_name.get(name)]
+        ),
         said=tuple(name for name in first if name not in effects),
         told=tuple(first),
         added=tuple(getattr(thing.candidate, "name", "") for thing in named),

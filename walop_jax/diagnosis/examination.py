@@ -318,14 +318,17 @@ def examine(
     hypotheses: Hypotheses,
     rng: np.random.Generator,
     earlier: Examination | None = None,
+    *,
+    synonyms_apart: bool = False,
 ) -> Examination:
     """Score effects that a model has not, sentences and patterns against a fit.
 
-    Descriptions that say what another candidate says are names of that one (`synonyms`). `earlier` is of a smaller
-    model: its names hold here, and its columns serve again where the light has hardly changed.
+    Descriptions that say what another candidate says are names of that one (`synonyms`); with `synonyms_apart`, for
+    studies, each is a candidate of its own. `earlier` is of a smaller model: its names hold here, and its columns serve
+    again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    known = None if earlier is None else earlier.also
+    known = earlier.also if earlier is not None else {} if synonyms_apart else None
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
