@@ -1,8 +1,8 @@
 """The search for missing effects: while something is missing, the most probable name of it is fitted and added.
 
 1. `selection` says how many things are missing, and which names each of them may have, by linear steps from the fit.
-2. The names of the most certain thing are fitted, the most probable first, until one of them is, with what its fit
-   found beyond the linear step, more probable than every name that was not fitted.
+2. The names of the thing with the most evidence are fitted, the most probable first, until one of them is, with what
+   its fit found beyond the linear step, more probable than every name that was not fitted.
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
    competes with the names: structural effects and other descriptions of the instrument (`Refits.others`).
 4. The most probable that data which took no part in its fit confirm joins the model, and the residuals are scored
@@ -263,7 +263,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
     turn, accepted = _Turn.of(state, judge), None
     named = (thing for thing in turn.posterior.things if not thing.is_pattern)
-    for thing in [*sorted(named, key=lambda thing: -thing.certainty), None]:
+    for thing in [*sorted(named, key=lambda thing: -thing.log_evidence), None]:
         passed = [] if thing is None else turn.names_of(thing)
         if (state.evidence.poor or thing is None) and not any(turn.explains(trial) for _, trial in passed):
             passed += turn.others(passed)

@@ -78,11 +78,6 @@ class Thing:
         return isinstance(self.candidate, str)
 
     @property
-    def certainty(self) -> float:
-        """Probability of its most probable name."""
-        return next(iter(self.probabilities.values()), 0.0)
-
-    @property
     def names(self) -> tuple[str, ...]:
         """The set of the thing: names that hold it with the probability `thresholds.CERTAIN`, by either prior."""
         return tuple(dict.fromkeys([*_shortest(self.probabilities), *_shortest(self.equal)]))
