@@ -44,6 +44,34 @@ def found() -> Diagnosis:
     )  # fmt: skip
 
 
+def test_the_first_line_says_what_is_missing_where_and_how_large(found: Diagnosis):
+    """Cause, place, size and probability, by hand; a description in its own words."""
+    spot = dataclasses.replace(
+        found.steps[0],
+        effect="blemish",
+        about="a dark spot in front of one camera, O2",
+        parameters={"depth": (0.006, 0.0005, ""), "x": (0.11, 0.01, "deg")},
+        descriptions=(),
+        probability=0.971,
+    )
+    assert spot.in_words == (
+        "a dark spot in front of one camera, O2: depth 0.00600 ± 0.00050, x 0.110 ± 0.010 deg (blemish, probability "
+        "0.97)"
+    )
+    turned = dataclasses.replace(
+        spot,
+        effect="clp_zero",
+        about="zero point of the polariser's encoder",
+        parameters={"angle": (0.2, 0.01, "deg")},
+        probability=0.9999,
+    )
+    assert turned.in_words == (
+        "zero point of the polariser's encoder: 0.200 ± 0.010 deg (clp_zero, probability above 0.99)"
+    )
+    facts = dict(dataclasses.replace(found, steps=(spot,), unexplained=None).display().facts)
+    assert facts["found"] == spot.in_words
+
+
 def comes_out(found: Diagnosis, monkeypatch) -> None:
     """What the command gets in place of a search of minutes."""
     monkeypatch.setattr("walop_jax.diagnosis.workflow.diagnose", lambda *args, **how: found)

@@ -10,7 +10,7 @@ from scipy import stats
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import SCALES, Projector, ScoreSpace
-from walop_jax.diagnosis.selection import Candidates, most_probable
+from walop_jax.diagnosis.selection import JointScores, most_probable
 from walop_jax.diagnosis.thresholds import CERTAIN
 from walop_jax.model.effects import Context, Described, effect_by_name
 
@@ -76,7 +76,7 @@ def log_density(residual, terms):
 def test_evidence_beside_members_is_a_ratio_of_densities_of_the_residuals(members):
     """ln p(r | M and g) − ln p(r | M), r ~ N(0, 1 + Σ t²w² c cᵀ), at every scale of the candidate."""
     found, columns, residual = scene({"clp_zero": [6.0], "turn of polariser": [4.0, -3.0]})
-    candidates = Candidates(found)
+    candidates = JointScores(found)
     chosen = [(candidates.names.index(name), 0.3 if SIZES[name] > 1 else 1.0) for name in members]
 
     def terms(name, scale):
@@ -104,7 +104,7 @@ def test_an_amplitude_that_physics_keeps_above_0_has_the_half_of_its_prior():
         # Columns are derivatives of the residuals data − model with the sign of an amplitude that is absent: r + a c.
         logs = -0.5 * (2.0 * a * (column @ residual) + a**2 * (column @ column))
         integral = np.trapezoid(2.0 * stats.norm(0.0, width).pdf(a) * np.exp(logs), a)
-        assert Candidates(found).beside([])[0, 0] == pytest.approx(np.log(integral), abs=1e-6)
+        assert JointScores(found).beside([])[0, 0] == pytest.approx(np.log(integral), abs=1e-6)
 
 
 def test_nothing_is_called_in_noise():

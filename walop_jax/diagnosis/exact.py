@@ -51,8 +51,8 @@ class Trial:
 
     `item` is its linear step, `linear` the evidence of that (NaN where there was none), `score` and `p_value` are those
     of the linear test when it was added. `fit` is None until it has been fitted. `alternatives` are other shapes of the
-    effect that do as well, in words. `rivals` are effects of nearly its evidence, or of which a part would do,
-    `nameless` sentences that are not improbable beside it. `predicts` is False where its linear step does not predict
+    effect that do as well, in words. `rivals` are effects that it may be as well, `nameless` descriptions, and
+    `probability` is that of its name among all of these. `predicts` is False where its linear step does not predict
     held-out data, `compared` are the fits without and with it (`refits.before_and_after`), `against` the KINDs of
     exposures that contradict it, `refused` the reason for which it was not added, `groups` the groups of sentences that
     were added one after the other, each with the candidates that were as good then. `also` are the other names of it
@@ -77,6 +77,7 @@ class Trial:
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    probability: float = float("nan")
 
     @property
     def name(self) -> str:

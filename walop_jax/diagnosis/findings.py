@@ -186,7 +186,8 @@ class Step(FitComparison):
     that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
     is the distance (σ) of each rival from it. `descriptions` are the sentences of an effect without a name
     (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
-    `also_called` are other names of it and of those, by name (`synonyms`).
+    `also_called` are other names of it and of those, by name (`synonyms`). `about` is the effect in words with its
+    place, `probability` that of its name among all names of the list, given that one of them is true (NaN: unknown).
     """
 
     effect: str
@@ -205,14 +206,36 @@ class Step(FitComparison):
     descriptions: tuple[tuple[Change, float, float], ...] = ()
     nameless: tuple[str, ...] = ()
     also_called: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    about: str = ""
+    probability: float = float("nan")
 
     @property
     def in_words(self) -> str:
-        """Its name; what has none in the words of its descriptions, or of the change of the instrument."""
+        """What is missing, where, how large it is and how probable its name.
+
+        For example "a dark spot in front of one camera, O2: depth 0.0060 ± 0.0005 at x 0.11 ± 0.01 deg (blemish,
+        probability 0.97)". What has no name is told by its descriptions, or by the change of the instrument.
+        """
         if self.descriptions:
-            return "; ".join(_sentence(*entry)["words"] for entry in self.descriptions)
-        change = self.choices.get("change", "")
-        return f"{self.effect} ({change})" if change else self.effect
+            words = " and ".join(_sentence(*entry)["words"] for entry in self.descriptions)
+            return f"{words}{self._likely(' (', ')')}"
+        if change := self.choices.get("change", ""):
+            return f"{change} ({self.effect})"
+        numbers = [
+            f"{name} {' ± '.join(value_and_error(value, sigma))} {unit}".rstrip()
+            for name, (value, sigma, unit) in self.parameters.items()
+        ]
+        if len(numbers) == 1:
+            numbers = [numbers[0].split(" ", 1)[1]]
+        size = f": {', '.join(numbers)}" if numbers else ""
+        return f"{self.about or self.effect}{size} ({self.effect}{self._likely(', ')})"
+
+    def _likely(self, before: str, after: str = "") -> str:
+        """Its probability in words; empty where that is not known."""
+        if not math.isfinite(self.probability):
+            return ""
+        value = "above 0.99" if self.probability > 0.99 else f"{self.probability:.2g}"
+        return f"{before}probability {value}{after}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -369,13 +392,15 @@ class Diagnosis(Drawn):
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
-        names = [step.in_words for step in self.steps]
+        found = [step.in_words for step in self.steps]
         if self.unexplained is not None:
-            names.append(self.unexplained.number or "something without a name")
+            found.append(self.unexplained.number or "something without a name")
+        first, *further = found or ["nothing beyond the starting model"]
         shown = Display(
             title=f"{self.subject}: not examined",
             facts=(
-                ("found", ", ".join(names) or "nothing beyond the starting model"),
+                ("found", first),
+                *(("", f"and {text}") for text in further),
                 ("χ²/dof", f"{before:.4g} → {after:.4g}"),
                 ("p of the starting model", probability(self.p_value).removeprefix("= ")),
                 ("field points", str(self.points)),
@@ -440,7 +465,7 @@ def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
     "alternatives", "equivalent", "nameless", "also_called", "separated_by", "where", "confirmed", "log_bayes",
-    "negligible",
+    "negligible", "probability",
 )  # fmt: skip
 
 

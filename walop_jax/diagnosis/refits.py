@@ -155,6 +155,7 @@ class Refits:
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
         compared, alike = trial.compared, (*trial.rivals, *trial.nameless)
         groups, also = {trial.name: alike} if trial.effect is Described else {}, trial.also
+        probability = trial.probability
         if result is not trial.fit:
             compared = before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
@@ -169,7 +170,11 @@ class Refits:
                 compared, **{key: getattr(earlier.compared, key) for key in before}
             )
             groups, also = {**earlier.groups, **groups}, {**earlier.also, **also}
-        found = {"compared": compared, "score": score, "p_value": p_value, "groups": groups, "also": also}
+            probability = min(probability, earlier.probability)
+        found = {
+            "compared": compared, "score": score, "p_value": p_value, "groups": groups, "also": also,
+            "probability": probability,
+        }  # fmt: skip
         step = dataclasses.replace(trial, **found)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])

@@ -293,15 +293,24 @@ def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: Iterable[Probable]) -> Trial:
-    """A trial with the other names of the thing that it is: those of its set, and those that fits find as probable."""
+    """A trial with the other names that it may have: those of the set of its thing, and those that fits find as likely.
+
+    And with its probability among all of these.
+    """
     worth = {other.name: probable for probable, other in passed}
     near = [name for name, value in worth.items() if value > worth[trial.name] - thresholds.IMPROBABLE]
+    linear = thing.probabilities if thing is not None and trial.item is not None else {}
     in_set = thing.names if thing is not None and trial.item is not None else ()
     own = trial.name, trial.effect.name
     names = [name for name in dict.fromkeys([*in_set, *near]) if name not in own]
     effects = {item.effect.name for item in evidence.ranked}
     nameless = tuple(name for name in names if name not in effects)[: thresholds.MOST_CLASSES]
-    rivals = tuple(name for name in names if name in effects)
     probes = {trial.name: "" if trial.item is None else trial.item.probe.name} | {n: n for n in nameless}
-    also = {name: evidence.also[probe] for name, probe in probes.items() if probe in evidence.also}
-    return dataclasses.replace(trial, rivals=rivals, nameless=nameless, also=also)
+    logs = {name: float(np.log(max(value, 1e-300))) for name, value in linear.items()} | worth
+    return dataclasses.replace(
+        trial,
+        rivals=tuple(name for name in names if name in effects),
+        nameless=nameless,
+        also={name: evidence.also[probe] for name, probe in probes.items() if probe in evidence.also},
+        probability=float(np.exp(worth[trial.name] - np.logaddexp.reduce(list(logs.values())))),
+    )

@@ -104,10 +104,10 @@ class Posterior:
 
 def most_probable(evidence: Evidence) -> Posterior:
     """The most probable set of things that are missing in a fit."""
-    return Candidates(evidence).posterior()
+    return JointScores(evidence).posterior()
 
 
-class Candidates:
+class JointScores:
     """All candidates of one fit, ready to be scored beside any few of them.
 
     Columns are in prior widths, and residuals in units of the scatter behind all candidates. Amplitudes that these data

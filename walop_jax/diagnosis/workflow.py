@@ -50,7 +50,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Described, EffectKind
+from walop_jax.model.effects import Described, Effect, EffectKind
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model
@@ -252,6 +252,8 @@ def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step
         log_bayes=trial.evidence,
         nameless=trial.nameless,
         also_called=trial.also,
+        about=_about(effect, result.model.template.cameras.names),
+        probability=trial.probability,
         alternatives=trial.alternatives,
         score=trial.score,
         p_value=trial.p_value,
@@ -265,3 +267,11 @@ def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step
         separated_by=effect.kind.separated_by if close or trial.nameless else "",
         where=describe(evidence.design, change),
     )
+
+
+def _about(effect: Effect, cameras: Sequence[str]) -> str:
+    """An effect in words, with its place: "a dark spot in front of one camera, O2"."""
+    first = (effect.kind.__doc__ or effect.name).strip().splitlines()[0].rstrip(".")
+    chosen = spoken_choices(effect)
+    places = [cameras[value] if name == "camera" else str(value) for name, value in chosen.items()]
+    return ", ".join([first[:1].lower() + first[1:], *places])
