@@ -346,7 +346,7 @@ def judged(evidence: Evidence) -> Verdict:
     if not evidence.alarm:
         return Verdict("consistent", (), ())
     posterior = most_probable(evidence)
-    named = sorted((t for t in posterior.things if not t.is_pattern), key=lambda thing: -thing.log_evidence)
+    named = [thing for thing in posterior.things if not thing.is_pattern]
     first = [next(iter(thing.probabilities)) for thing in named]
     effects = {probe.effect.name for probe in evidence.probes}
     verdict = Verdict(

@@ -6,7 +6,8 @@
 3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
    competes with the names: structural effects and other descriptions of the instrument (`Refits.others`).
 4. The most probable that data which took no part in its fit confirm joins the model, and the residuals are scored
-   again. Of a thing none of whose names is confirmed the next one is asked.
+   again. Of a thing none of whose names is confirmed the next one is asked, unless a pattern describes it best: what is
+   weaker would be fitted without it, and imitate it.
 
 All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `Judge` says
 what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps (`tests/diagnosis/linear_judge.py`).
@@ -183,11 +184,12 @@ class _Turn:
         """The names of a thing that nothing speaks against, as they were fitted.
 
         Names outside of the set of the thing are fitted only where the fits of those in it have found them less
-        probable than their linear steps said.
+        probable than their linear steps said. Of a thing that a pattern describes best the first name is fitted all the
+        same: linear steps are off by parts of a per cent, which a pattern follows and a name does not.
         """
         passed = list[Probable]()
-        for name, probability in thing.probabilities.items():
-            if not passed and name not in thing.names:
+        for number, (name, probability) in enumerate(thing.probabilities.items()):
+            if not passed and (name not in thing.names or (thing.is_pattern and number)):
                 break
             item = _candidate(self.evidence, name, thing)
             if item is None or item.name in self.trials:
@@ -198,10 +200,22 @@ class _Turn:
                 break
             self.fits += 1
             trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
-            if self.passes(trial):
-                beyond = (trial.evidence - trial.linear) / self.evidence.floor**2
-                passed.append((expected + beyond, trial))
+            worth = expected + (trial.evidence - trial.linear) / self.evidence.floor**2
+            if self.passes(trial) and not self._is_pattern(thing, trial, worth):
+                passed.append((worth, trial))
         return passed
+
+    def _is_pattern(self, thing: Thing, trial: Trial, worth: float) -> bool:
+        """Whether a thing is more probably a pattern without a name than what a trial says; it is noted then.
+
+        Where a trial leaves nothing but noise of what was clearly missing, a pattern can only describe the same with
+        more numbers.
+        """
+        if worth > thing.patterns or (trial.noise and not explains(self.evidence.chi2, self.evidence.dof)):
+            return False
+        refused = f"a pattern without a name is more probable, by {thing.patterns - worth:.3g} in ln B"
+        self.trials[trial.name] = dataclasses.replace(trial, refused=refused)
+        return True
 
     def explains(self, trial: Trial) -> bool:
         """Whether a trial explains so much that what has no linear step need not be asked."""
@@ -246,33 +260,35 @@ class _Turn:
 
     def _less_probable(self, name: str) -> str:
         """What is more probable than a name that was not tried, in words."""
-        things = [thing for thing in self.posterior.things if name in thing.probabilities]
+        things, least = self.posterior.things, 1.0 - thresholds.CERTAIN
         if not things:
             return f"nothing more is missing with a probability of {self.posterior.nothing_more:.2g}"
-        thing = max(things, key=lambda thing: thing.probabilities[name])
+        # A name that nothing is likely to be is held against what is missing most clearly.
+        thing = next((t for t in things if t.probabilities.get(name, 0.0) > least), things[0])
         if thing.is_pattern:
             return f"a pattern without a name is more probable ({thing.candidate})"
-        best = next(iter(thing.probabilities))
+        best, probability = next(iter(thing.probabilities)), thing.probabilities.get(name, 0.0)
         if best == name:
-            return "the search was broken off before it was its turn"
-        probability = thing.probabilities[name]
+            return "something else is missing more clearly, and was asked first"
         return f"{best} is more probable: {thing.probabilities[best]:.2g}, and this {probability:.1g}"
 
 
 def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
     turn, accepted = _Turn.of(state, judge), None
-    named = (thing for thing in turn.posterior.things if not thing.is_pattern)
-    for thing in [*sorted(named, key=lambda thing: -thing.log_evidence), None]:
+    things = list(turn.posterior.things)
+    while accepted is None and not judge.over(turn.fits):
+        thing = things.pop(0) if things else None
         passed = [] if thing is None else turn.names_of(thing)
         if (state.evidence.poor or thing is None) and not any(turn.explains(trial) for _, trial in passed):
             passed += turn.others(passed)
         accepted = turn.confirmed(passed)
         if accepted is not None:
             accepted = _with_rivals(state.evidence, accepted, thing, passed)
+        elif thing is None:
             break
-        if judge.over(turn.fits):
-            break
+        elif thing.is_pattern:  # what is weaker would be fitted without it, and imitate it
+            things = []
     added = "" if accepted is None else accepted.name
     rounds = (*state.rounds, Round(state.evidence.table.p_global, added, tuple(turn.reasons(added))))
     ended = judge.over(turn.fits) if accepted is None else ""

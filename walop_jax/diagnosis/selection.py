@@ -63,7 +63,9 @@ class Thing:
     ln B beside the other things, in units of the scatter behind all candidates. `probabilities` are those of all names
     of effects and of all descriptions, the most probable first; `equal` the same, were all of them equally probable
     beforehand. `shapes` are the probes that each name of the set may mean, down to the `thresholds.CERTAIN` part of its
-    probability.
+    probability. `patterns` is ln of the ratio of the probability that it is a pattern without a name to the one that it
+    is any of the names; of the thing with the most evidence beside the other things or alone, whichever is less: the
+    others may be there only because linear steps are off by parts of a per cent of it.
     """
 
     candidate: Probe | str
@@ -71,6 +73,7 @@ class Thing:
     probabilities: Mapping[str, float]
     equal: Mapping[str, float]
     shapes: Mapping[str, tuple[Probe, ...]]
+    patterns: float = -np.inf
 
     @property
     def is_pattern(self) -> bool:
@@ -85,7 +88,10 @@ class Thing:
 
 @dataclasses.dataclass(frozen=True)
 class Posterior:
-    """The most probable set of things for one fit, and the probability that nothing more is missing beside them."""
+    """The most probable set of things for one fit, that with the most evidence first.
+
+    And the probability that nothing more is missing beside them.
+    """
 
     things: tuple[Thing, ...]
     nothing_more: float
@@ -139,6 +145,7 @@ class JointScores:
             if len(chosen := np.flatnonzero((sizes == size) & np.isfinite(self.log_prior)))
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
+        self.is_named = np.array([name in self.probes for name in self.names])
 
     def _block(
         self, chosen: Int[np.ndarray, " n"], size: int
@@ -201,7 +208,15 @@ class JointScores:
             if nothing_more > 1.0 - thresholds.CERTAIN or len(members) == thresholds.MOST_STEPS:
                 break
             members = self._exchanged([*members, best], odds)
-        return Posterior(tuple(self._things(members)), nothing_more)
+        things = sorted(self._things(members), key=lambda thing: -thing.log_evidence)
+        if things:
+            alone = self._odds_of_patterns(self._probable([])[0])
+            things[0] = dataclasses.replace(things[0], patterns=min(things[0].patterns, alone))
+        return Posterior(tuple(things), nothing_more)
+
+    def _odds_of_patterns(self, worth: Vector) -> float:
+        """ln of the ratio of the probability of all patterns to that of all names, from ln of B π of candidates."""
+        return _log_sum(worth[~self.is_named]) - _log_sum(worth[self.is_named])
 
     def _probable(self, members: Sequence[Member]) -> tuple[Vector, Float[np.ndarray, "n t"]]:
         """ln of B π of every candidate beside some members, and its evidence by scale."""
@@ -240,8 +255,9 @@ class JointScores:
             bayes = self.over_scales(self.beside(others))
             bayes[[number for number, _ in others]] = -np.inf
             number = int(np.argmax(bayes + self.log_prior))
-            name = self.names[number]
-            yield Thing(self.probes.get(name, name), float(bayes[number]), *self._named(bayes))
+            name, worth = self.names[number], bayes + self.log_prior
+            patterns = self._odds_of_patterns(worth)
+            yield Thing(self.probes.get(name, name), float(bayes[number]), *self._named(bayes), patterns)
 
     def _named(
         self, bayes: Vector
