@@ -18,12 +18,16 @@ NAMES = ("clp_zero", "rotator_zero", "lens_birefringence")
 SHARED = 0.97  # cosine between the first two names
 
 
-def evidence(amplitudes, seed=1, shared=SHARED):
-    """Two names that are much alike, a third one and a pattern beside a base of two parameters; noise of unit size."""
+def evidence(amplitudes, seed=1, shared=SHARED, pattern_like=0.0):
+    """Two names that are much alike, a third one and a pattern beside a base of two parameters; noise of unit size.
+
+    `pattern_like` is the cosine between the first name and the pattern.
+    """
     rng = np.random.default_rng(seed)
     base, columns = rng.standard_normal((ROWS, 2)), rng.standard_normal((ROWS, 4))
     columns /= np.linalg.norm(columns, axis=0)
     columns[:, 1] = shared * columns[:, 0] + np.sqrt(1.0 - shared**2) * columns[:, 1]
+    columns[:, 3] = pattern_like * columns[:, 0] + np.sqrt(1.0 - pattern_like**2) * columns[:, 3]
     residual = rng.standard_normal(ROWS) - columns[:, : len(amplitudes)] @ amplitudes
     projector = Projector(base)
     residual = projector(residual)
@@ -91,7 +95,18 @@ def test_two_effects_are_found_one_after_the_other():
 
 
 def test_what_a_pattern_explains_better_is_not_given_a_name():
-    assert names(evidence([0.0, 0.0, 4.0, 30.0]), Linear()) in ([], ["lens_birefringence"])
+    """Nor is what is weaker: it would be fitted without the pattern."""
+    judge = Counting()
+    assert names(evidence([0.0, 0.0, 9.0, 30.0]), judge) == []
+    assert len(judge.fits) == 1
+
+
+@pytest.mark.parametrize(("surprise", "named"), [(0.0, []), (30.0, ["clp_zero"])])
+def test_a_name_that_a_pattern_imitates_is_asked_by_its_fit(surprise, named):
+    """A truth that a name misses by 14 %: ½ 30² (1 − 0.99²) = 9 in ln B, which its fit may find or not."""
+    judge = Counting({"clp_zero": surprise})
+    assert names(evidence([0.0, 0.0, 0.0, 30.0], pattern_like=0.99), judge) == named
+    assert judge.fits[0] == "clp_zero"
 
 
 def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
