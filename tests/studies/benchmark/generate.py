@@ -279,7 +279,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--nulls", type=int, default=200)
     parser.add_argument("--ratios", type=float, nargs="+", default=(10.0, 30.0), help="signal to noise")
-    parser.add_argument("--new", action="store_true", help="shapes that made no rule, for ablation.py")
+    parser.add_argument("--new", action="store_true", help="shapes that are in no published scene")
     parser.add_argument("--check", action="store_true", help="fail unless the hashes are the published ones")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
