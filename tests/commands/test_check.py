@@ -263,6 +263,25 @@ def test_stars_tell_since_when_a_calibration_does_not_hold(call, run: Path, cata
     assert {entry.name for entry in (tmp_path / "OUT").iterdir()} == {"check.json", "watch.fits", "watch.png"}
 
 
+@pytest.mark.parametrize("factor", [3.0, 0.5])
+def test_errors_that_are_not_those_of_the_counts_are_no_go_by_both_commands(
+    call, run: Path, catalogue: Path, tmp_path: Path, factor: float
+):
+    table = Table.read(catalogue)
+    table["N_ERR"] *= factor
+    table.write(tmp_path / "odd.fits")
+    said = r"no go: N_ERR is (\S+) times too " + ("large" if factor > 1 else "small")
+    for command in (
+        ("check", run, tmp_path / "odd.fits"),
+        ("apply", run, tmp_path / "odd.fits", "-o", tmp_path / "OUT.fits"),
+    ):
+        done = call(*command)
+        assert done.exit_code == 3
+        told = re.search(said, done.stdout.splitlines()[0])
+        assert told is not None, done.output
+        assert float(told[1]) == pytest.approx(max(factor, 1 / factor), rel=0.25)
+
+
 def test_a_new_set_that_agrees_and_one_that_does_not(call, run: Path, fitted: FittedSet, tmp_path: Path):
     """Another night of the same instrument; one with a camera that has become fainter by 1 %."""
     truth = simulate(SMALL, seed=SEED).truth

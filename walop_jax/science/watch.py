@@ -361,8 +361,11 @@ class Watching(StarSearch):
 
     def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
         """Residuals behind a change."""
-        grown = change.history.over(self.time)[self.group, None] * size
-        return self.stars.behind(residual, lambda part, rows: self.columns.of(part, change) * grown[rows])
+        return self.stars.behind(residual, lambda *part: self.column(*part, change) * size)
+
+    def column(self, part: StarResiduals, rows: slice, change: PossibleChange) -> Residuals:
+        """The column of a change in some stars, of which these are the rows, over its history."""
+        return self.columns.of(part, change) * change.history.over(self.time)[self.group[rows], None]
 
     # --------------------------------------------------------------------------------------------- asking
 
@@ -385,7 +388,7 @@ class Watching(StarSearch):
                 self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
-        result = self.told(changes, matrix, score, scale)
+        result = self.told(changes, matrix, score, residual, scale)
         # Stars that were left out as they disagree by more than noise ever does.
         dof = np.maximum(self.stars.dof.astype(float), 1e-12)
         chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
@@ -481,7 +484,7 @@ class Watching(StarSearch):
     def _dated(self, best: PossibleChange, alike: list[PossibleChange]) -> FoundChange:
         began = self.time[[entry.history.start for entry in alike]]
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
-        return FoundChange(best, tuple(alike), *when)
+        return FoundChange(best, tuple(alike), *when, off=self.off([best, *alike]))
 
     def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
@@ -534,8 +537,7 @@ class Watching(StarSearch):
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
         def columns(part: StarResiduals, rows: slice) -> Float[np.ndarray, "r k c"]:
-            grown = (e.history.over(self.time)[self.group[rows], None] for e in asked)
-            steps = [g * self.columns.of(part, e) for g, e in zip(grown, asked, strict=True)]
+            steps = [self.column(part, rows, entry) for entry in asked]
             return np.concatenate([np.stack(steps, axis=-1), self.errors(part)], axis=-1)
 
         matrix, score = residuals.normal_matrix(self.stars, residual, columns, weights)
@@ -545,7 +547,9 @@ class Watching(StarSearch):
             (entry for entry in sized if np.isfinite(entry.error)), key=lambda entry: -abs(entry.sigma)
         )
 
-    def told(self, changes: list[FoundChange], matrix: Matrix, score: Score, whole: Scale) -> Watch:
+    def told(
+        self, changes: list[FoundChange], matrix: Matrix, score: Score, residual: Residuals, whole: Scale
+    ) -> Watch:
         """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
@@ -576,7 +580,26 @@ class Watching(StarSearch):
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=whole.value if residuals.is_off(whole, ALARM) else 1.0,
+            noise=self.noise(residual, whole),
             tests=self.tests,
             alarm=self.alarm,
+            photons=self.photons,
         )
+
+    def noise(self, residual: Residuals, about_zero: Scale) -> float:
+        """χ² per degree of freedom of all stars; 1 where N_ERR says so, or errors of the calibration explain it."""
+        if self.crowded or not residuals.is_off(about_zero, ALARM):
+            return 1.0
+        stated = Weights(about_zero.kept / self.variance, about_zero.share)
+        matrix, score = residuals.normal_matrix(
+            self.stars, residual, lambda *part: self.errors(part[0]), stated
+        )
+        root = whitening(matrix + np.eye(len(score)), residuals.SINGULAR)
+        errors = root @ (root.T @ score)
+        if places.is_near(errors[:-2]):
+            remaining = self.stars.behind(residual, lambda *part: self.errors(part[0]) @ errors)
+            dof = self.stars.dof.astype(float)
+            behind = residuals.noise_scale(self.stars.chi2(remaining) / self.variance, dof)
+            if not residuals.is_off(behind, ALARM):
+                return 1.0
+        return about_zero.value
