@@ -146,7 +146,7 @@ class OwnLightCheck:
     """What the q and u of so many `stars` say of the arms, and the `scatter` of their own polarisation in q or u.
 
     `tests` are all questions, each alone; `alike` those that describe the stars as well as the best one, if one is
-    found, best first, and `off` is what the worst of these does to q or u of a star (median; None: none is found).
+    found, best first, and `off` is by how much the best of these moves q or u of a star (median; None: none is found).
     """
 
     stars: int
@@ -253,8 +253,10 @@ def own_light_check(light: OwnLight, arms: Sequence[tuple[str, str]]) -> OwnLigh
     if best.chance < alarm:
         least = best.sigma**2 - RIVAL
         alike = sorted((t for t in tests if t.sigma**2 > least), key=lambda t: -abs(t.sigma))
-    unit = np.median(np.abs(light.questions).max(axis=1), axis=0)  # larger shift of q or u, median star
-    off = max((float(abs(t.size) * unit[tests.index(t)]) for t in alike), default=None)
+    off = None
+    if alike:
+        shift = light.questions[..., tests.index(best)] * best.size
+        off = float(np.median(np.abs(shift).max(axis=1)))
     return OwnLightCheck(int(fitted.used.sum()), float(np.sqrt(fitted.scatter)), tests, tuple(alike), off)
 
 

@@ -124,15 +124,14 @@ class StarSearch:
         self.matters = np.abs(vectors.root).max(axis=0, initial=0.0) > 0
         self.root = vectors.root[:, self.matters]
 
-    def off(self, changes: Sequence[PossibleChange]) -> float | None:
-        """What the worst of some changes does to q or u of the stars that it moves: the median of the larger shift.
+    def off(self, alike: Sequence[PossibleChange]) -> float | None:
+        """By how much the simplest of changes alike, that of a camera if there is one, moves q or u of stars.
 
-        None where it has no column, or moves no star.
+        The median of the larger shift, of the stars that it acts on; None where it has no column, or moves no star.
         """
-        things = {change.thing: change for change in changes if change.kind != UNNAMED}
-        return max(filter(None, map(self._shift, things.values())), default=None)
-
-    def _shift(self, change: PossibleChange) -> float | None:
+        change = next((entry for entry in alike if entry.camera), alike[0])
+        if change.kind == UNNAMED:
+            return None
         shifts = [part.shift(self.column(part, rows, change)) for _, rows, part in self.stars.blocks()]
         largest = np.abs(change.size * np.concatenate(shifts)).max(axis=1)
         moved = largest > _MOVED * largest.max(initial=0.0)

@@ -70,7 +70,7 @@ class FoundChange:
 
     In a survey it began at `time` (MJD, or the number of the group), or, as others describe the stars as well, at any
     time `between` the first and the last of theirs; in a catalogue it was there always, and these are NaN. `off` is
-    what the worst of `alike` does to q or u of the stars that it moves (a fraction, median; None: not known).
+    by how much the simplest of `alike`, of a camera if there is one, moves q or u of stars (`StarSearch.off`).
     """
 
     best: PossibleChange
@@ -115,7 +115,7 @@ class FoundChange:
 class DisagreeingPlace:
     """A place where stars disagree: centre, size (deg), σ, stars, causes (best first): spots of these `cameras`.
 
-    `off` is what the worst of them does to q or u of the stars there (a fraction, median; None: not known).
+    `off` is by how much the best of them moves q or u of the stars there (`StarSearch.off`).
     """
 
     x: float
@@ -239,9 +239,10 @@ class CatalogueCheck:
     def against(self) -> tuple[Doubt, ...]:
         """A reason for each thing that does not hold, with its remedy; places forbid nothing.
 
-        `Doubt.off` is the shift of q or u by a change, an arm, the sky or a place (median of the stars that it moves),
-        and the scatter that errors lack, √(s − 1) of that of the photons with s χ² per degree of freedom. It is not
-        known, and so ranked ahead of all that is, where the counts are not those of the instrument.
+        `Doubt.off` is the shift of q or u by a change (the simplest of those alike), an arm, the sky or a place, median
+        of the stars that it acts on; and the scatter that errors lack, √(s − 1) of that of the photons, s χ² per degree
+        of freedom. It is not known, and so ranked ahead of all that is, where the counts are not those of the
+        instrument.
         """
         if self.readings is not None and self.readings.mended:
             return (Doubt(Quality.CATALOGUE, self.readings.words(), remedy=CORRECT),)
