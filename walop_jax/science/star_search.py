@@ -78,7 +78,6 @@ _CELLS = 3  # in a size, along a side
 _TOGETHER = 1 / 64  # of the largest |X|, |Y|: rows of a star that lie closer are one
 _BLIND = 1e-3  # cᵀPc over cᵀc below which a star does not see a camera
 _MOST = 8  # places
-_MOVED = 0.1  # of the largest shift of q or u, from which a change acts on a star
 _WIDER = 2.0  # than the size that was looked for a place may be, and so far off its centre
 
 ColumnProducts = Float[np.ndarray, "c c"]
@@ -134,8 +133,7 @@ class StarSearch:
             return None
         shifts = [part.shift(self.column(part, rows, change)) for _, rows, part in self.stars.blocks()]
         largest = np.abs(change.size * np.concatenate(shifts)).max(axis=1)
-        moved = largest > _MOVED * largest.max(initial=0.0)
-        return float(np.median(largest[moved])) if moved.any() else None
+        return float(np.median(largest[largest > 0])) if largest.any() else None
 
     def column(self, part: StarResiduals, rows: slice, change: PossibleChange) -> Residuals:
         """The column of a change in some stars, of which these are the rows."""
