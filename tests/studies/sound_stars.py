@@ -178,8 +178,9 @@ def tables_of_check(name: str) -> AnalysisVectors:
 
 def watched(name: str, stars: Catalogue) -> str:
     """The first sentence of `check` against a catalogue by the tables of a design, made once; empty: none."""
-    watching.AnalysisVectors = lambda held: tables_of_check(name)
-    return next(iter(watching.watch(vectors(name).calibration, [stars]).warnings), "")
+    tables = vectors(name)
+    watching.AnalysisVectors = lambda held: tables if held is tables.calibration else tables_of_check(name)
+    return next(iter(watching.watch(tables.calibration, [stars]).warnings), "")
 
 
 def sound(total: int) -> None:

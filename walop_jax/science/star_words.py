@@ -335,7 +335,8 @@ class Watch(Displayed):
     (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
     errors. `remarks` are about rows left out; `misread` says of catalogues that they are not what they say: what
-    their stars say of the instrument means nothing, and changes are not told where any is so.
+    their stars say of the instrument means nothing, and changes are not told where any is so. `of_catalogues` is what
+    holds against single ones, by all that `apply` asks, where nothing is found in their course.
     """
 
     cameras: tuple[str, ...]
@@ -352,6 +353,7 @@ class Watch(Displayed):
     remarks: tuple[str, ...] = ()
     misread: tuple[str, ...] = ()
     photons: float = np.nan
+    of_catalogues: tuple[Doubt, ...] = ()
 
     @property
     def noise_is_off(self) -> bool:
@@ -361,7 +363,7 @@ class Watch(Displayed):
     @property
     def holds(self) -> bool:
         """True if calibration and errors stand."""
-        return not (self.changes or self.noise_is_off or self.misread)
+        return not (self.changes or self.noise_is_off or self.misread or self.of_catalogues)
 
     @property
     def doubtful(self) -> bool:
@@ -383,7 +385,7 @@ class Watch(Displayed):
         if self.noise_is_off:
             off = _lacking(self.noise, self.photons)
             doubts.append(Doubt(Quality.CATALOGUE, _errors_are_off(self.noise), off=off, remedy=ERRORS))
-        return (*doubts, *remarks)
+        return (*doubts, *self.of_catalogues, *remarks)
 
     @property
     def stars_in_words(self) -> str:
@@ -451,7 +453,7 @@ class Watch(Displayed):
             seen = f"{100.0 * self.smallest[g].min():.2g}"
             rows.append((when, f"{self.stars[g]}", f"{self.chi2[g]:.2f}", *gains, seen))
         title = "The calibration is still valid"
-        if self.misread or (self.noise >= SCATTERED and not self.changes):
+        if self.misread or self.of_catalogues or (self.noise >= SCATTERED and not self.changes):
             title = "The stars DO NOT SHOW whether the calibration is still valid"
         elif self.changes:
             title = "The calibration IS NO LONGER VALID"

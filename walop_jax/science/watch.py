@@ -35,14 +35,17 @@ from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.calibration.calibration import Calibration
+from walop_jax.fit.verdict import Doubt
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects.in_models import effect_context, known_effects, with_effects
 from walop_jax.science import star_columns as alarms
 from walop_jax.science import star_residuals as residuals
 from walop_jax.science import star_search as places
-from walop_jax.science.apply import readings_in, residuals_of
+from walop_jax.science.apply import apply_by, readings_in, residuals_of
 from walop_jax.science.catalogue import Catalogue
+from walop_jax.science.catalogue_verdict import verdict_on
+from walop_jax.science.overlaps import overlap
 from walop_jax.science.star_columns import (
     ALARM,
     OF_SURVEYS,
@@ -83,7 +86,8 @@ def watch(
     Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
     an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
     are looked at, spread over the stars. Each catalogue is first asked whether it is what it says (`readings_in`), with
-    all readings where the stars contradict the calibration as no change of it does. Raises `DataError` as
+    all readings where the stars contradict the calibration as no change of it does. Where nothing is found in its
+    course, each catalogue is asked as `apply` asks it: what holds against it there holds here. Raises `DataError` as
     `science.apply.apply` does, and where no row has a camera to spare.
     """
     vectors = AnalysisVectors(with_rivals(calibration))
@@ -108,7 +112,20 @@ def watch(
     result = Watching(stars, vectors).watch()
     if result.doubtful and not wrong:
         wrong = tuple(misread(doubted=True))
-    return dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
+    result = dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
+    if not result.holds:
+        return result
+    alone, of_each = AnalysisVectors(calibration), list[Doubt]()
+    for name, catalogue in given:
+        reduced, seen_twice = (
+            apply_by(alone, catalogue, force=force),
+            overlap(calibration, catalogue, force=force),
+        )
+        for doubt in verdict_on(calibration, catalogue, reduced, seen_twice).doubts:
+            if doubt.blocking:
+                text = f"{name}: {doubt.sentence}" if told else doubt.sentence
+                of_each.append(dataclasses.replace(doubt, sentence=text))
+    return dataclasses.replace(result, of_catalogues=tuple(of_each))
 
 
 def named(names: Sequence[str], count: int) -> list[str]:
@@ -388,20 +405,46 @@ class Watching(StarSearch):
                 self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
-        result = self.told(changes, matrix, score, residual, scale)
-        # Stars that were left out as they disagree by more than noise ever does.
-        dof = np.maximum(self.stars.dof.astype(float), 1e-12)
-        chi2 = self.stars.chi2(residual) / (self.variance * max(scale.value, 1.0))
-        largest = special.chdtri(dof, ALARM / len(dof))
-        odd = (weights.inverse == 0) & (self.stars.dof > 0) & (chi2 > largest)
+        noise, remarks = self._scatter(residual, weights, scale)
+        return dataclasses.replace(self.told(changes, matrix, score, noise), remarks=remarks)
+
+    def _scatter(self, residual: Residuals, weights: Weights, scale: Scale) -> tuple[float, tuple[str, ...]]:
+        """χ² per degree of freedom of all stars, 1 where N_ERR says so; a remark on stars that lie off by themselves.
+
+        Nothing is said that errors of the calibration explain.
+        """
+        dof = self.stars.dof.astype(float)
+        largest = special.chdtri(np.maximum(dof, 1e-12), ALARM / len(dof))
+        left_out, off = (
+            (weights.inverse == 0) & (dof > 0),
+            residuals.is_off(scale, ALARM) and not self.crowded,
+        )
+        chi2 = self.stars.chi2(residual) / self.variance
+        if off or np.any(left_out & (chi2 > largest * max(scale.value, 1.0))):
+            chi2 = self.stars.chi2(self._explained(residual, scale)) / self.variance
+            off = off and residuals.is_off(residuals.noise_scale(chi2, dof), ALARM)
+        odd = left_out & (chi2 > largest * max(scale.value, 1.0))
+        noise = scale.value if off else 1.0
         if not odd.any():
-            return result
+            return noise, ()
         worst = self.stars.first[np.argmax(np.where(odd, chi2, 0.0))]
         remark = (
             f"{odd.sum()} of {len(dof)} stars disagree with the calibration each by itself and were left out, the "
             f"worst at X {self.stars.x[worst]:+.3f}°, Y {self.stars.y[worst]:+.3f}°: blends, cosmic rays, bad pixels?"
         )
-        return dataclasses.replace(result, remarks=(remark,))
+        return noise, (remark,)
+
+    def _explained(self, residual: Residuals, scale: Scale) -> Residuals:
+        """Residuals behind the errors of the calibration that explain them best, if these are as chance makes them."""
+        stated = Weights(scale.kept / self.variance, scale.share)
+        matrix, score = residuals.normal_matrix(
+            self.stars, residual, lambda *part: self.errors(part[0]), stated
+        )
+        root = whitening(matrix + np.eye(len(score)), residuals.SINGULAR)
+        errors = root @ (root.T @ score)
+        if not places.is_near(errors[:-2]):
+            return residual
+        return self.stars.behind(residual, lambda *part: self.errors(part[0]) @ errors)
 
     def _likeliest(self, ways: list[Settled]) -> Settled | None:
         """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
@@ -547,9 +590,7 @@ class Watching(StarSearch):
             (entry for entry in sized if np.isfinite(entry.error)), key=lambda entry: -abs(entry.sigma)
         )
 
-    def told(
-        self, changes: list[FoundChange], matrix: Matrix, score: Score, residual: Residuals, whole: Scale
-    ) -> Watch:
+    def told(self, changes: list[FoundChange], matrix: Matrix, score: Score, noise: float) -> Watch:
         """The record: gains are those behind the changes, and the changes that each camera may be."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
@@ -580,26 +621,8 @@ class Watching(StarSearch):
             error=error,
             smallest=smallest,
             changes=tuple(changes),
-            noise=self.noise(residual, whole),
+            noise=noise,
             tests=self.tests,
             alarm=self.alarm,
             photons=self.photons,
         )
-
-    def noise(self, residual: Residuals, about_zero: Scale) -> float:
-        """χ² per degree of freedom of all stars; 1 where N_ERR says so, or errors of the calibration explain it."""
-        if self.crowded or not residuals.is_off(about_zero, ALARM):
-            return 1.0
-        stated = Weights(about_zero.kept / self.variance, about_zero.share)
-        matrix, score = residuals.normal_matrix(
-            self.stars, residual, lambda *part: self.errors(part[0]), stated
-        )
-        root = whitening(matrix + np.eye(len(score)), residuals.SINGULAR)
-        errors = root @ (root.T @ score)
-        if places.is_near(errors[:-2]):
-            remaining = self.stars.behind(residual, lambda *part: self.errors(part[0]) @ errors)
-            dof = self.stars.dof.astype(float)
-            behind = residuals.noise_scale(self.stars.chi2(remaining) / self.variance, dof)
-            if not residuals.is_off(behind, ALARM):
-                return 1.0
-        return about_zero.value
