@@ -422,6 +422,7 @@ class Watch(Displayed):
             "smallest_step_seen": float(np.min(self.smallest)),
             "chi2_per_dof": self.noise,
             "misread": list(self.misread),
+            "of_catalogues": [doubt.sentence for doubt in self.of_catalogues],
             "tests": self.tests,
             "alarm_sigma": self.alarm,
             "groups": groups,

@@ -115,17 +115,24 @@ def watch(
     result = dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
     if not result.holds:
         return result
-    alone, of_each = AnalysisVectors(calibration), list[Doubt]()
-    for name, catalogue in given:
-        reduced, seen_twice = (
-            apply_by(alone, catalogue, force=force),
-            overlap(calibration, catalogue, force=force),
-        )
-        for doubt in verdict_on(calibration, catalogue, reduced, seen_twice).doubts:
-            if doubt.blocking:
-                text = f"{name}: {doubt.sentence}" if told else doubt.sentence
-                of_each.append(dataclasses.replace(doubt, sentence=text))
+    of_each = [
+        dataclasses.replace(doubt, sentence=f"{name}: {doubt.sentence}" if told else doubt.sentence)
+        for name, doubt in _of_catalogues(calibration, given, force=force)
+    ]
     return dataclasses.replace(result, of_catalogues=tuple(of_each))
+
+
+def _of_catalogues(
+    calibration: Calibration, given: Sequence[tuple[str, Catalogue]], *, force: bool
+) -> Iterator[tuple[str, Doubt]]:
+    """What `apply` would hold against each catalogue, with its name; nothing that is about the calibration itself."""
+    vectors, of_fit = AnalysisVectors(calibration), calibration.verdict
+    for name, catalogue in given:
+        stars = apply_by(vectors, catalogue, force=force)
+        seen_twice = overlap(calibration, catalogue, force=force)
+        for doubt in verdict_on(calibration, catalogue, stars, seen_twice).doubts:
+            if doubt.blocking and (of_fit.trusted or doubt.bit != of_fit.quality):
+                yield name, doubt
 
 
 def named(names: Sequence[str], count: int) -> list[str]:
