@@ -385,7 +385,7 @@ class Watching(StarSearch):
 
     def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
         """Residuals behind a change."""
-        return self.stars.behind(residual, lambda *part: self.column(*part, change) * size)
+        return self.stars.behind(residual, lambda part, rows: self.column(part, rows, change) * size)
 
     def column(self, part: StarResiduals, rows: slice, change: PossibleChange) -> Residuals:
         """The column of a change in some stars, of which these are the rows, over its history."""
