@@ -336,7 +336,7 @@ class Watch(Displayed):
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
     errors. `remarks` are about rows left out; `misread` says of catalogues that they are not what they say: what
     their stars say of the instrument means nothing, and changes are not told where any is so. `of_catalogues` is what
-    holds against single ones, by all that `apply` asks, where nothing is found in their course.
+    holds against single ones, by all that `apply` asks, where no change is found in their course.
     """
 
     cameras: tuple[str, ...]
@@ -382,7 +382,7 @@ class Watch(Displayed):
             Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE)
             for change in self.changes
         ]
-        if self.noise_is_off:
+        if self.noise_is_off and not self.of_catalogues:  # these ask for more that may make it
             off = _lacking(self.noise, self.photons)
             doubts.append(Doubt(Quality.CATALOGUE, _errors_are_off(self.noise), off=off, remedy=ERRORS))
         return (*doubts, *self.of_catalogues, *remarks)

@@ -86,7 +86,7 @@ def watch(
     Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
     an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
     are looked at, spread over the stars. Each catalogue is first asked whether it is what it says (`readings_in`), with
-    all readings where the stars contradict the calibration as no change of it does. Where nothing is found in its
+    all readings where the stars contradict the calibration as no change of it does. Where no change is found in its
     course, each catalogue is asked as `apply` asks it: what holds against it there holds here. Raises `DataError` as
     `science.apply.apply` does, and where no row has a camera to spare.
     """
@@ -113,7 +113,7 @@ def watch(
     if result.doubtful and not wrong:
         wrong = tuple(misread(doubted=True))
     result = dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
-    if not result.holds:
+    if result.changes or result.misread:
         return result
     of_each = [
         dataclasses.replace(doubt, sentence=f"{name}: {doubt.sentence}" if told else doubt.sentence)
