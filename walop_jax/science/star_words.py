@@ -334,9 +334,11 @@ class Watch(Displayed):
     By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
     (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
-    errors. `remarks` are about rows left out; `misread` says of catalogues that they are not what they say: what
-    their stars say of the instrument means nothing, and changes are not told where any is so. `of_catalogues` is what
-    holds against single ones, by all that `apply` asks, where no change is found in their course.
+    errors. `noise` is χ² per degree of freedom of all stars behind the changes, 1 where it is that of N_ERR; `photons`
+    as in `CatalogueCheck`. `remarks` are about rows left out, `odd` about stars that lie off alone; `misread` says of
+    catalogues that they are not what they say: what their stars say of the instrument means nothing, and changes are
+    not told where any is so. `of_catalogues` is what holds against single ones, by all that `apply` asks, where changes
+    in their course do not explain the stars.
     """
 
     cameras: tuple[str, ...]
@@ -354,6 +356,7 @@ class Watch(Displayed):
     misread: tuple[str, ...] = ()
     photons: float = np.nan
     of_catalogues: tuple[Doubt, ...] = ()
+    odd: tuple[str, ...] = ()
 
     @property
     def noise_is_off(self) -> bool:
@@ -374,15 +377,17 @@ class Watch(Displayed):
     @property
     def against(self) -> tuple[Doubt, ...]:
         """A reason for each thing that does not hold, ranked as those of a catalogue (`CatalogueCheck.against`)."""
-        remarks = [Doubt(Quality(0), text, blocking=False, remedy=TIMES) for text in self.remarks]
+        of_rows = [(text, TIMES) for text in self.remarks] + [(text, ERRORS) for text in self.odd]
+        remarks = [Doubt(Quality(0), text, blocking=False, remedy=cure) for text, cure in of_rows]
         if self.misread:
             misread = (Doubt(Quality.CATALOGUE, text, remedy=CORRECT) for text in self.misread)
             return (*misread, *remarks)
+        # A single exposure group has no course, and all catalogues are asked for more that may make the scatter.
+        changes = () if self.of_catalogues and len(self.time) == 1 else self.changes
         doubts = [
-            Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE)
-            for change in self.changes
+            Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE) for change in changes
         ]
-        if self.noise_is_off and not self.of_catalogues:  # these ask for more that may make it
+        if self.noise_is_off and not self.of_catalogues:
             off = _lacking(self.noise, self.photons)
             doubts.append(Doubt(Quality.CATALOGUE, _errors_are_off(self.noise), off=off, remedy=ERRORS))
         return (*doubts, *self.of_catalogues, *remarks)

@@ -61,7 +61,7 @@ from walop_jax.science.star_columns import (
 )
 from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
 from walop_jax.science.star_search import Seen, StarSearch, Strongest, fitted, scored
-from walop_jax.science.star_words import FoundChange, Watch
+from walop_jax.science.star_words import CALIBRATE, DATE_IT, FoundChange, Watch
 
 WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
 MISREAD_ROWS = 2048  # of catalogues of which it means nothing
@@ -86,8 +86,9 @@ def watch(
     Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
     an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
     are looked at, spread over the stars. Each catalogue is first asked whether it is what it says (`readings_in`), with
-    all readings where the stars contradict the calibration as no change of it does. Where no change is found in its
-    course, each catalogue is asked as `apply` asks it: what holds against it there holds here. Raises `DataError` as
+    all readings where the stars contradict the calibration as no change of it does. Where changes in
+    their course do not explain the stars, or there is one exposure group, each catalogue is asked as `apply` asks it:
+    what holds against it there holds here. Raises `DataError` as
     `science.apply.apply` does, and where no row has a camera to spare.
     """
     vectors = AnalysisVectors(with_rivals(calibration))
@@ -112,8 +113,9 @@ def watch(
     result = Watching(stars, vectors).watch()
     if result.doubtful and not wrong:
         wrong = tuple(misread(doubted=True))
-    result = dataclasses.replace(result, remarks=(*remarks, *result.remarks), misread=wrong)
-    if result.changes or result.misread:
+    result = dataclasses.replace(result, remarks=remarks, misread=wrong)
+    explained = result.changes and not result.noise_is_off and len(result.time) > 1
+    if explained or result.misread:
         return result
     of_each = [
         dataclasses.replace(doubt, sentence=f"{name}: {doubt.sentence}" if told else doubt.sentence)
@@ -132,7 +134,8 @@ def _of_catalogues(
         seen_twice = overlap(calibration, catalogue, force=force)
         for doubt in verdict_on(calibration, catalogue, stars, seen_twice).doubts:
             if doubt.blocking and (of_fit.trusted or doubt.bit != of_fit.quality):
-                yield name, doubt
+                dated_here = doubt.remedy == DATE_IT
+                yield name, dataclasses.replace(doubt, remedy=CALIBRATE) if dated_here else doubt
 
 
 def named(names: Sequence[str], count: int) -> list[str]:
@@ -412,8 +415,8 @@ class Watching(StarSearch):
                 self.spoilt |= profile(x, y, change.best.place) > 0
             weights, scale = self.weights(residual)
             matrix, score = self.scan(residual, weights)
-        noise, remarks = self._scatter(residual, weights, scale)
-        return dataclasses.replace(self.told(changes, matrix, score, noise), remarks=remarks)
+        noise, odd = self._scatter(residual, weights, scale)
+        return dataclasses.replace(self.told(changes, matrix, score, noise), odd=odd)
 
     def _scatter(self, residual: Residuals, weights: Weights, scale: Scale) -> tuple[float, tuple[str, ...]]:
         """χ² per degree of freedom of all stars, 1 where N_ERR says so; a remark on stars that lie off by themselves.
