@@ -17,9 +17,10 @@ from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.star_columns import PossibleChange
+from walop_jax.science.star_history import Watching, grouped
 from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
 from walop_jax.science.star_words import FoundChange, Watch
-from walop_jax.science.watch import Watching, dated, grouped, watch, with_rivals
+from walop_jax.science.watch import dated, watch, with_rivals
 
 
 @pytest.fixture(scope="module")
