@@ -263,7 +263,7 @@ GENERIC = {
 }  # fmt: skip
 TO_BE_MOVED = (
     "diagnosis/", "science/catalogue_doubts.py", "science/catalogue_readings.py", "science/star_residuals.py",
-    "science/watch.py",
+    "science/star_history.py",
 )  # fmt: skip
 """Files that still have aliases of their own under names that have another home: whoever changes one renames them."""
 

@@ -258,9 +258,31 @@ def test_stars_tell_since_when_a_calibration_does_not_hold(call, run: Path, cata
     assert not answer["watch"].holds
     assert answer.document()["watch"]["changes"][0]["time"] == pytest.approx(61222.9)
     (change,) = answer["watch"].changes
-    if change.off is not None:
-        assert change.off == pytest.approx(0.02, rel=0.2)
+    assert change.off == pytest.approx(0.02, rel=0.2)
     assert {entry.name for entry in (tmp_path / "OUT").iterdir()} == {"check.json", "watch.fits", "watch.png"}
+
+
+@pytest.mark.parametrize(
+    ("errors", "counts", "said"),
+    [
+        (3.0, (1.0, 1.0, 1.0, 1.0), r"no go: N_ERR is (2\.[5-9]|3)\S* times too large"),
+        (0.5, (1.0, 1.0, 1.0, 1.0), r"no go: N_ERR is (1\.[6-9]|2)\S* times too small"),
+        (1.0, (1.02, 0.98, 1.0, 1.0), r"no go: q and u of \d+ stars follow .*O1 brighter by (3\.[5-9]|4)"),
+    ],
+)
+def test_what_apply_holds_against_a_catalogue_check_holds_as_well(
+    call, run: Path, catalogue: Path, tmp_path: Path, errors: float, counts: tuple[float, ...], said: str
+):
+    """Errors that are not those of the counts; light exchanged inside an arm, of which no sum of its cameras knows."""
+    table = Table.read(catalogue)
+    table["N_ERR"] *= errors
+    table["N"] *= counts
+    table.write(tmp_path / "odd.fits")
+    inputs = (run, tmp_path / "odd.fits")
+    for command in (("check", *inputs), ("apply", *inputs, "-o", tmp_path / "OUT.fits")):
+        done = call(*command)
+        assert done.exit_code == 3, done.output
+        assert re.search(said, done.stdout.splitlines()[0]), done.output
 
 
 def test_a_new_set_that_agrees_and_one_that_does_not(call, run: Path, fitted: FittedSet, tmp_path: Path):

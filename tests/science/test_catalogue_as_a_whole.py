@@ -11,10 +11,15 @@ from star_tables import SOUTH, read, setting, stars
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.user_tables import in_memory
-from walop_jax.fit.verdict import Hidden, Quality, Structure, UndetectedError
+from walop_jax.fit.verdict import Hidden, Quality, Structure, UndetectedError, Verdict
 from walop_jax.science.apply import apply
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.catalogue_doubts import units_of_counts
+from walop_jax.science.star_columns import PossibleChange
+from walop_jax.science.star_light import LeftOverSky
+from walop_jax.science.star_residuals import StarResiduals
+from walop_jax.science.star_search import scored
+from walop_jax.science.star_words import NOTHING_TO_SPARE, FoundChange
 from walop_jax.science.stokes_columns import about_cameras
 
 pytestmark = pytest.mark.usefixtures("tabulated_once")
@@ -27,6 +32,71 @@ def noisy(vectors, tmp_path, seed=5, count=600, **options):
 def pulls(found, qu):
     """Root mean square of q and u off, in stated errors."""
     return np.sqrt(np.mean((found.qu - qu) ** 2 / np.einsum("sii->si", found.covariance), axis=0))
+
+
+def test_a_column_alone_beside_others_has_the_size_of_its_normal_equations():
+    """By hand. Of 5x + 2z = 7, 2x + 4z = −6: 4x = 10. Beside y as well, of Q = [5 2 1; 2 4 0; 1 0 2], g = [7 −6 3]:
+    x (5 − 1 − ½) = 7 + 3 − 3/2."""
+    x, y = PossibleChange("O1", True), PossibleChange("E1", True)
+    (alone,) = scored([x], np.array([[5.0, 2.0], [2.0, 4.0]]), np.array([7.0, -6.0]))
+    assert (alone.size, alone.error, alone.sigma) == pytest.approx((2.5, 0.5, 5.0))
+    matrix = np.array([[5.0, 1.0, 2.0], [1.0, 2.0, 0.0], [2.0, 0.0, 4.0]])  # of x, y, z
+    both = scored([x, y], matrix, np.array([7.0, 3.0, -6.0]))
+    assert [change.size for change in both] == pytest.approx([2.5, 1.5])
+    assert [change.error for change in both] == pytest.approx([4.0**-0.5, 2.0**-0.5])
+    beside = scored([x, y], matrix, np.array([7.0, 3.0, -6.0]), beside=[1])
+    assert (beside[0].size, beside[0].error) == pytest.approx((8.5 / 3.5, 3.5**-0.5))
+    assert beside[1] == y
+    # What others describe as well has no size.
+    (nothing,) = scored([x], np.array([[1.0, 2.0], [2.0, 4.0]]), np.array([1.0, 2.0]))
+    assert nothing == x
+
+
+def test_a_gain_moves_q_by_half_of_itself():
+    """An unpolarised star behind ideal analysers: q = (N₀ − N₁)/(N₀ + N₁), so that one camera brighter by β is β/2."""
+    root = np.full((1, 4), 1e3**-0.5)  # 1000 electrons a camera
+    ends = np.array([[[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]]) * 1e3 * root[:, None]
+    zero, none = np.zeros(1), np.zeros((1, 4, 0))
+    star = StarResiduals(
+        np.zeros(1, int), 0.0 * root, 1e3 * root, ends, np.eye(2)[None] / 2e3, root, zero, zero, zero, none,
+        np.zeros((1, 4, 4)), np.ones((1, 1)), np.zeros((1, 4, 2)),
+    )  # fmt: skip
+    for camera, moved in enumerate(([0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5])):
+        change = 1e3 * root * (np.arange(4) == camera)
+        np.testing.assert_allclose(star.shift(change), [moved], atol=1e-12)
+    np.testing.assert_allclose(star.shift(1e3 * root), 0.0, atol=1e-12)  # all cameras are flux
+
+
+def test_reasons_are_ranked_by_what_they_do_to_q_and_u():
+    """Sizes typed by hand, found in another order: 2 %, sky of half the light of which 1 % is left, 3⁰·⁵ of 0.1 %."""
+    changes = [
+        PossibleChange(name, True, size=size, error=1e-4) for name, size in (("O1", 1e-3), ("E2", 0.04))
+    ]
+    found = dataclasses.replace(
+        NOTHING_TO_SPARE,
+        changes=tuple(FoundChange(c, (c,), off=0.5 * c.size) for c in changes),
+        noise=4.0,
+        noise_p=0.0,
+        asked=20,
+        photons=1e-3,
+        sky=LeftOverSky(np.array([0.01, 0.0]), np.array([1e-4, 1e-4]), 500, 0.5),
+    )
+    reasons = Verdict().with_doubts(found.against).reasons
+    words = ("E2 brighter by 4", "light of the sky", "N_ERR is 2 times too small", "O1 brighter by 0.1")
+    assert [word in reason.sentence for word, reason in zip(words, reasons, strict=True)] == [True] * 4
+    assert [reason.off for reason in reasons] == pytest.approx([0.02, 0.005, 3**0.5 * 1e-3, 5e-4])
+    assert len({reason.cure for reason in reasons}) == 3  # one for each kind
+    wide = dataclasses.replace(
+        found, changes=tuple(FoundChange(c, (c,)) for c in [changes[0]._replace(size=0.3)])
+    )
+    first, *others = Verdict().with_doubts(wide.against).reasons
+    assert first.off is None  # may do anything
+    assert "contradict the calibration by more than an instrument changes" in first.sentence
+    assert len(others) == 2
+    large = dataclasses.replace(NOTHING_TO_SPARE, noise=1 / 9, noise_p=0.0, asked=20, photons=1e-3)
+    (reason,) = large.against
+    assert reason.off == 0.0  # q and u are right, their errors are not
+    assert "q, u off" not in reason.words
 
 
 @pytest.mark.parametrize(("factor", "words"), [(0.1, "times too small"), (5.0, "times too large")])
@@ -109,9 +179,14 @@ def test_counts_with_errors_that_no_photons_have_and_unused_cameras_are_remarked
 
 
 def test_two_settings_of_the_plate_name_the_camera(vectors, calibration, tmp_path):
+    """And what it does to q and u is what these differ by from those without it."""
     table, _ = noisy(vectors, tmp_path, plate=(None, 22.5))
+    sound = apply(calibration, read(table, tmp_path))
     table["N"][:, 1] *= 1.02
-    (change,) = apply(calibration, read(table, tmp_path)).check.changes
+    found = apply(calibration, read(table, tmp_path))
+    (change,) = found.check.changes
+    moved = np.median(np.abs(found.qu - sound.qu).max(axis=1))
+    assert change.off == pytest.approx(moved, rel=0.05)
     assert {entry.name for entry in change.alike} == {"E1"}
     assert "E1 brighter by 2.0" in change.words() or "E1 brighter by 1.9" in change.words()
 

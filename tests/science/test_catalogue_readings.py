@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 from star_tables import stars
+from studies import sound_stars
 
 from walop_jax.data.settings import Settings
+from walop_jax.science import apply as application
 from walop_jax.science.catalogue_readings import CatalogueReadings, readings_of
-from walop_jax.science.other_readings import CatalogueRows, turned
+from walop_jax.science.other_readings import CatalogueReading, CatalogueRows, Fit, turned
 
 ROTATOR = 35.0
 
@@ -36,6 +38,20 @@ def ordered(rows: CatalogueRows, order) -> CatalogueRows:
 
 def placed(rows: CatalogueRows, x, y) -> CatalogueRows:
     return rows.changed(x=x, y=y)
+
+
+@pytest.mark.parametrize("left", [94, 2])
+def test_where_a_tenth_would_still_disagree_another_instrument_is_asked_for(left):
+    """Stars of a WALOP-NORTH by a calibration of WALOP-SOUTH: an order of cameras mends all but 94 of 300."""
+    order = CatalogueReading(
+        "N were in the order O2, O1", "exchange them", lambda rows: rows, Fit(0.0, left / 300, 0.02)
+    )
+    stands = Fit(1e4, 299 / 300, 0.03)
+    said = CatalogueReadings(300, stands, (order,), instrument="WALOP-SOUTH").words()
+    assert said.startswith(
+        f"299 of 300 stars disagree with the calibration; they would agree (all but {left} of 300)"
+    )
+    assert ("not of WALOP-LAB or WALOP-NORTH" in said) == (left > 30)
 
 
 def test_sound_catalogues_have_no_other_reading(vectors, sound):
@@ -153,3 +169,16 @@ def test_magnitudes_and_a_camera_in_another_unit(vectors, sound):
 def test_few_stars_say_nothing(vectors, sound):
     few = ordered(sound.of(sound.star < 7), [1, 0, 2, 3])
     assert readings_of(vectors, few) is None
+
+
+@pytest.mark.parametrize(
+    ("order", "said"), [([0, 1, 2, 3], ""), ([1, 0, 2, 3], "in the order E1, O1, O2, E2")]
+)
+def test_an_exchange_where_no_camera_is_to_spare(monkeypatch, order, said):
+    """WALOP-NORTH: two fluxes, q and u of four cameras; the scatter of q and u tells."""
+    monkeypatch.setattr(application, "AnalysisVectors", application.AnalysisVectors)  # the study replaces it
+    made = sound_stars.catalogue("WALOP-NORTH", 300, 1)
+    given = dataclasses.replace(made, counts=made.counts[:, order], sigma=made.sigma[:, order])
+    text = sound_stars.said(sound_stars.reduced("WALOP-NORTH", given), given)
+    assert said in text
+    assert bool(text) == bool(said)

@@ -13,10 +13,14 @@ from studies import watch as study
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
 from walop_jax.data.user_tables import in_memory
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
+from walop_jax.science.star_columns import PossibleChange
+from walop_jax.science.star_history import Watching, grouped
 from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
-from walop_jax.science.watch import Watching, dated, grouped, watch, with_rivals
+from walop_jax.science.star_words import FoundChange, Watch
+from walop_jax.science.watch import dated, watch, with_rivals
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +122,30 @@ def test_records_of_a_watch():
     assert "IS NO LONGER VALID" in watch.display().text()
     assert len(watch_figure(watch).axes) == 4
     assert document["smallest_step_seen"] == pytest.approx(watch.smallest.min())
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_reasons_of_a_survey_by_hand(groups):
+    """Errors that lack √3 of 0.1 % do more than a camera by 0.05 %; what catalogues say of the scatter takes its place.
+
+    A single exposure group has no course: there it takes the place of the change as well.
+    """
+    gain = PossibleChange("O1", True, size=1e-3, error=1e-4)
+    of_groups, of_gains = np.zeros(groups), np.ones((groups, 1))
+    found = Watch(
+        ("O1",), 60000.0 + np.arange(groups), of_groups.astype(int), of_groups, of_gains, of_gains, of_gains,
+        (FoundChange(gain, (gain,), 60000.0, (60000.0, 60000.0), 5e-4),), 4.0, 10, 5.0, photons=1e-3, odd=("one star",),
+    )  # fmt: skip
+    noise, change, remark = Verdict().with_doubts(found.against).reasons
+    assert noise.off == pytest.approx(3**0.5 * 1e-3)
+    assert "N_ERR is 2 times too small" in noise.sentence
+    assert change.off == 5e-4
+    assert (remark.blocking, remark.cure) == (False, noise.cure)
+    better = dataclasses.replace(
+        found, of_catalogues=(Doubt(Quality.CATALOGUE, "E2 is not linear", off=2e-3),)
+    )
+    said = [reason.sentence for reason in Verdict().with_doubts(better.against).reasons]
+    assert said == ["E2 is not linear", *([change.sentence] if groups > 1 else []), "one star"]
 
 
 def test_scale_of_noise_is_that_of_the_many():

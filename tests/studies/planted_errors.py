@@ -166,6 +166,8 @@ ERRORS = (
             "science/test_estimate.py"),
     planted("science/estimate.py", "return -np.add.reduceat(gain @ change, first)",
             "return np.add.reduceat(gain @ change, first)", "science/test_estimate.py"),
+    planted("science/star_search.py", "size=float(slope * error**2)", "size=float(-slope * error**2)",
+            "science/test_catalogue_as_a_whole.py"),
     planted("science/polarisation.py", "sin**2 * qq - 2.0 * cos * sin * qu_", "sin**2 * qq + 2.0 * cos * sin * qu_",
             "science/test_polarisation.py"),
     planted("science/polarisation.py", "np.mod(np.rad2deg(0.5 * np.arctan2(u, q)), 180.0)",

@@ -37,9 +37,10 @@ from walop_jax.science import apply as application  # noqa: E402
 from walop_jax.science.apply import residuals_of  # noqa: E402
 from walop_jax.science.catalogue import read_catalogue  # noqa: E402
 from walop_jax.science.overlaps import Overlap, overlap  # noqa: E402
+from walop_jax.science.star_history import Watching  # noqa: E402
 from walop_jax.science.star_residuals import StarResiduals  # noqa: E402
 from walop_jax.science.star_words import Watch  # noqa: E402
-from walop_jax.science.watch import Watching, with_rivals  # noqa: E402
+from walop_jax.science.watch import with_rivals  # noqa: E402
 
 NIGHTS, START = 10, 6
 PLATES = (None, 22.5)

@@ -133,7 +133,8 @@ def check(
 
     RUN STARS...: is it still good for these stars, and since when not? Rows of one MJD are a group; catalogues without
     MJD are a group each, in their order. Steps, drifts and single groups of cameras and arms are looked for, over the
-    whole field, growing over it, or in a spot, and changes of the optics that explain the stars as well.
+    whole field, growing over it, or in a spot, and changes of the optics that explain the stars as well. Where none is
+    found, each catalogue is asked as by apply: what is no go there is no go here.
 
     NEW_RUN --against OLD_RUN STARS...: what does the new calibration change in these catalogues? A night is to be made
     again where more than 5 % of its stars shift by more than --limit, or gain or lose their result. Both may be surveys

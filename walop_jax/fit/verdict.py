@@ -113,7 +113,7 @@ class Doubt:
     @property
     def words(self) -> str:
         """Sentence, effect on stars and remedy, each said once."""
-        number = "" if self.off is None else per_cent(self.off)
+        number = per_cent(self.off) if self.off else ""
         size = f" (q, u off by {number} %)" if number and f"{number} %" not in self.what else ""
         told = not self.cure or self.cure in self.what or ("walop-jax " in self.what and not self.remedy)
         return f"{self.what}{size}" if told else f"{self.what}{size}; {self.cure}"

@@ -104,7 +104,14 @@ def apply(
     catalogue with more optical settings than can be tabulated, and, unless `force` is given, for settings that the
     calibration does not cover (`check_validity`).
     """
-    work = _Application(AnalysisVectors(calibration), catalogue, force=force)
+    return apply_by(AnalysisVectors(calibration), catalogue, progress, force=force)
+
+
+def apply_by(
+    vectors: AnalysisVectors, catalogue: Catalogue, progress: Told = None, *, force: bool = False
+) -> Stars:
+    """`apply` by the tables of a calibration, which several catalogues share."""
+    work = _Application(vectors, catalogue, force=force)
     chosen, few = work.sample(STAR_SAMPLE), work.sample(OWN_SAMPLE)
     readings = work.readings(chosen)
     # What the stars say of the instrument means nothing where they are not what the catalogue says.

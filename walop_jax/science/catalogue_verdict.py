@@ -1,4 +1,10 @@
-"""The verdict on a reduced catalogue: may its q and u be used? All doubts, the one that explains most first."""
+"""The verdict on a reduced catalogue: may its q and u be used? All doubts, the one that does most to q and u first.
+
+What a doubt does is known of the stars together (`CatalogueCheck.against`), of places that differ (`Overlap.excess`)
+and of a calibration whose verdict says it. It is not known of numbers that cannot be what they say, of another reading
+of the rows, and of settings or places that were not calibrated: these may do anything to q and u, and come first, in
+this order. What follows from a doubt about all stars is not told again of each.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +55,8 @@ def _against(
     if not of_fit.trusted:
         (why,) = calibration.warnings
         text = why.replace("this calibration is", "the calibration is")
-        yield Doubt(of_fit.quality, text, remedy=of_fit.reasons[0].cure)
+        first = of_fit.reasons[0]
+        yield Doubt(of_fit.quality, text, off=first.off, remedy=first.cure)
     if not check.misread:
         yield from of_check
     if seen_twice is not None:
@@ -62,10 +69,13 @@ def _against(
             )
             for text in seen_twice.warnings()
         )
+    told = any(doubt.blocking for doubt in of_check)
+    at_places = max((place.off for place in check.places if place.off is not None), default=None)
     for bit, cure in OF_STARS.items():
         share = float(np.mean(stars.flag & bit > 0)) if len(stars.flag) else 0.0
-        if share > MOST and not of_fit.quality & bit:
-            yield Doubt(bit, f"FLAG {bit:d} of {100 * share:.0f} % of the stars: {bit.meaning}", remedy=cure)
+        if share > MOST and not of_fit.quality & bit and not (told and bit == Quality.DISAGREES):
+            text = f"FLAG {bit:d} of {100 * share:.0f} % of the stars: {bit.meaning}"
+            yield Doubt(bit, text, off=at_places if bit == Quality.PLACE else None, remedy=cure)
     if of_fit.trusted:
         for text in calibration.warnings:
             yield Doubt(

@@ -164,8 +164,9 @@ class Judge:
         on_sky = np.stack([vectors[..., 0], *axes], axis=-1)
         sigma = np.hypot(rows.sigma, FLOOR * np.abs(np.nan_to_num(rows.counts)))
         found = estimate(on_sky, rows.counts, sigma, rows.star, self.vectors.instrument.cameras)
-        good = np.isfinite(found.qu).all(axis=1) & (found.dof > 0)
-        off = np.where(good, found.chi2, np.inf)
+        good = np.isfinite(found.qu).all(axis=1)
+        # Without a camera to spare any counts agree: the scatter alone tells readings apart.
+        off = np.where(good, np.where(found.dof > 0, found.chi2, 0.0), np.inf)
         dof = np.maximum(found.dof, 1)
         limit = special.chdtri(dof, IMPROBABLE)
         loss = np.minimum(off, CAP * dof)
@@ -455,14 +456,19 @@ def all_gains(judge: Judge, rows: CatalogueRows) -> Iterator[CatalogueReading]:
         ratio = counts / expected
         factors = np.nanmedian(ratio.mean(axis=1, keepdims=True) / ratio, axis=0)
     if np.isfinite(factors).all() and (factors > 0).all():
-        others = " or ".join(name for name in shipped() if name != judge.vectors.instrument.name)
         listed = ", ".join(f"{factor:.4g}" for factor in factors)
         yield CatalogueReading(
             f"N of {', '.join(names)} were {listed} times as large",
-            f"are they of the calibrated instrument, and not of {others} or another one; are all cameras in one unit?",
+            f"{of_another(judge.vectors.instrument.name)}; are all cameras in one unit?",
             _scaled(factors),
             usual=bool(np.all(np.abs(factors - 1.0) <= LARGEST)),
         )
+
+
+def of_another(instrument: str) -> str:
+    """The question whether stars were seen by another instrument, shipped ones by name."""
+    others = " or ".join(name for name in shipped() if name != instrument)
+    return f"are they of the calibrated instrument, and not of {others} or another one"
 
 
 def _scaled(factors: Float[np.ndarray, " k"]) -> Callable[[CatalogueRows], CatalogueRows]:

@@ -14,10 +14,10 @@ A gradient has two columns, and any direction φ in the field:
 φ is that in which z² is largest, which is then χ² of two numbers; it counts as `DIRECTIONS` questions.
 
 A catalogue is asked for all columns that were there always (`star_search`), a survey for those of cameras, arms, spots
-and optics in every history (`watch`). Both describe what they find by `PossibleChange`, and raise their alarms by these
-numbers: changes within Δχ² < `RIVAL` of the best describe the stars as well as it, and are given together. Columns are
-of first order: a relative change β of a camera makes them wrong by β of themselves, and χ² by 2β at most, which counts
-as well from `BENT` on.
+and optics in every history (`star_history`). Both describe what they find by `PossibleChange`, and raise their alarms
+by these numbers: changes within Δχ² < `RIVAL` of the best describe the stars as well as it, and are given together.
+Columns are of first order: a relative change β of a camera makes them wrong by β of themselves, and χ² by 2β at most,
+which counts as well from `BENT` on.
 """
 
 from __future__ import annotations

@@ -146,13 +146,14 @@ class OwnLightCheck:
     """What the q and u of so many `stars` say of the arms, and the `scatter` of their own polarisation in q or u.
 
     `tests` are all questions, each alone; `alike` those that describe the stars as well as the best one, if one is
-    found, best first.
+    found, best first, and `off` is by how much the best of these moves q or u of a star (median; None: none is found).
     """
 
     stars: int
     scatter: float
     tests: tuple[ArmChange, ...]
     alike: tuple[ArmChange, ...]
+    off: float | None = None
 
     @property
     def found(self) -> bool:
@@ -252,7 +253,11 @@ def own_light_check(light: OwnLight, arms: Sequence[tuple[str, str]]) -> OwnLigh
     if best.chance < alarm:
         least = best.sigma**2 - RIVAL
         alike = sorted((t for t in tests if t.sigma**2 > least), key=lambda t: -abs(t.sigma))
-    return OwnLightCheck(int(fitted.used.sum()), float(np.sqrt(fitted.scatter)), tests, tuple(alike))
+    off = None
+    if alike:
+        shift = light.questions[..., tests.index(best)] * best.size
+        off = float(np.median(np.abs(shift).max(axis=1)))
+    return OwnLightCheck(int(fitted.used.sum()), float(np.sqrt(fitted.scatter)), tests, tuple(alike), off)
 
 
 class _Fitted(NamedTuple):
@@ -420,11 +425,15 @@ def _student(t: float, dof: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class LeftOverSky:
-    """Polarised light of the sky left over, `share` (q, u) of its level, with `errors`, from so many `stars`."""
+    """Polarised light of the sky left over, `share` (q, u) of its level, with `errors`, from so many `stars`.
+
+    `level` is that of the sky over the light of a star (median).
+    """
 
     share: Float[np.ndarray, " 2"]
     errors: Float[np.ndarray, " 2"]
     stars: int
+    level: float
 
     @property
     def p_value(self) -> float:
@@ -435,6 +444,11 @@ class LeftOverSky:
     def found(self) -> bool:
         """True if there is some."""
         return self.p_value < SKY_CHANCE
+
+    @property
+    def off(self) -> float:
+        """By how much it moves q, u of a star (median)."""
+        return float(np.hypot(*self.share)) * self.level
 
     @property
     def bound(self) -> float:
@@ -475,7 +489,8 @@ def left_over_sky(
     slopes = [_slope(columns, qu[chosen, k], photon[chosen, k, k]) for k in range(2)]
     share, errors = np.array(slopes).T
     measured = np.isfinite(slopes).all() and (errors > 0).all()
-    return LeftOverSky(share, errors, len(chosen)) if measured else None
+    level = float(np.median(ratio[chosen]))
+    return LeftOverSky(share, errors, len(chosen), level) if measured else None
 
 
 def _slope(columns: Float[np.ndarray, "s 3"], values: OfStars, variance: OfStars) -> tuple[float, float]:

@@ -150,9 +150,17 @@ class StarResiduals:
 
     def left(self, change: Residuals) -> Residuals:
         """P c of one change of the counts over σ."""
+        free, moved = self._without_flux(change)
+        taken = np.einsum("rik,ri->rk", self.tangent, moved[self.star])
+        return np.where(self.root > 0, free - taken, 0.0)
+
+    def shift(self, change: Residuals) -> Float[np.ndarray, "s 2"]:
+        """H Tᵀ c: by how much one change of the counts over σ moves (q, u) of every star."""
+        return self._without_flux(change)[1]
+
+    def _without_flux(self, change: Residuals) -> tuple[Residuals, Float[np.ndarray, "s 2"]]:
         free, along = self.projected(change[..., None])
-        moved = np.einsum("sij,sjc->sic", self.photon, along)[self.star, :, 0]
-        return np.where(self.root > 0, free[0] - np.einsum("rik,ri->rk", self.tangent, moved), 0.0)
+        return free[0], np.einsum("sij,sj->si", self.photon, along[..., 0])
 
     def behind(self, residual: Residuals, change: Callable[[StarResiduals, slice], Residuals]) -> Residuals:
         """Residuals behind a change of the counts over σ, which `change` gives for some stars and their rows."""

@@ -55,6 +55,7 @@ from walop_jax.science.star_columns import (
     MOST_LIKELY,
     OF_CATALOGUES,
     RIVAL,
+    UNNAMED,
     PossibleChange,
     SpotPlace,
     StarColumns,
@@ -101,6 +102,11 @@ def scored(
     return sized
 
 
+def is_near(errors: Float[np.ndarray, " n"]) -> bool:
+    """True if errors of the calibration, in units of its root, are no larger than chance makes them."""
+    return bool(errors @ errors <= _FARTHEST**2 * len(errors))
+
+
 class StarSearch:
     """Stars, the columns that are asked of them, and the errors of the calibration, which raise no alarm.
 
@@ -113,8 +119,25 @@ class StarSearch:
         self.cameras = self.columns.cameras
         self.variance = own_variance(stars)
         self.crowded = bool(np.median(self.variance) > residuals.CROWDED)
+        self.photons = float(np.sqrt(0.5 * np.median(np.trace(stars.photon, axis1=1, axis2=2))))
         self.matters = np.abs(vectors.root).max(axis=0, initial=0.0) > 0
         self.root = vectors.root[:, self.matters]
+
+    def off(self, alike: Sequence[PossibleChange]) -> float | None:
+        """By how much the simplest of changes alike, that of a camera if there is one, moves q or u of stars.
+
+        The median of the larger shift, of the stars that it acts on; None where it has no column, or moves no star.
+        """
+        change = next((entry for entry in alike if entry.camera), alike[0])
+        if change.kind == UNNAMED:
+            return None
+        shifts = [part.shift(self.column(part, rows, change)) for _, rows, part in self.stars.blocks()]
+        largest = np.abs(change.size * np.concatenate(shifts)).max(axis=1)
+        return float(np.median(largest[largest > 0])) if largest.any() else None
+
+    def column(self, part: StarResiduals, rows: slice, change: PossibleChange) -> Residuals:
+        """The column of a change in some stars, of which these are the rows."""
+        return self.columns.of(part, change)
 
     def errors(self, part: StarResiduals) -> Float[np.ndarray, "r k n"]:
         """Columns of the errors of the calibration and of unknown colours, of unit variance."""
@@ -215,7 +238,7 @@ class CatalogueSearch(StarSearch):
         if self._suspicious(look, tests):  # else one linear step is all there is to do
             # Errors of the calibration that explain the stars best with N_ERR as stated.
             _, explained = self._settled(self._looked(self.start, stated=True), self.start, [], stated=True)
-            plausible = self._is_near(explained[self.asked : -2])
+            plausible = is_near(explained[self.asked : -2])
             # Scatter that they can explain is not held against N_ERR.
             if plausible and not residuals.is_off((by_errors := self._looked(explained)).noise, self._alarm):
                 look, sizes = by_errors, explained
@@ -250,6 +273,7 @@ class CatalogueSearch(StarSearch):
             changes=changes,
             smallest=smallest,
             growth=self.columns.growth,
+            photons=self.photons,
         )
         return dataclasses.replace(check, places=self._places(check, look, sizes, chosen))
 
@@ -265,11 +289,7 @@ class CatalogueSearch(StarSearch):
             places = places_of(self.stars, self.cameras, self._left(sizes), variance)
             if not places:
                 break
-        return places
-
-    @staticmethod
-    def _is_near(errors: Float[np.ndarray, " n"]) -> bool:
-        return bool(errors @ errors <= _FARTHEST**2 * len(errors))
+        return tuple(dataclasses.replace(place, off=self.off(place.alike)) for place in places)
 
     def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
         """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
@@ -278,7 +298,7 @@ class CatalogueSearch(StarSearch):
         """
         errors = np.zeros(len(self.matters))
         errors[self.matters] = self.nearest[self.asked : -2]
-        return errors if self._is_near(errors[self.matters]) else None
+        return errors if is_near(errors[self.matters]) else None
 
     def bend(self, errors: Float[np.ndarray, " n"], residual: Residuals) -> float:
         """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
@@ -320,7 +340,7 @@ class CatalogueSearch(StarSearch):
         alike = rivals_of(best, measured)
         # A gain is the simplest of what describes the stars alike.
         ranked = sorted(alike, key=lambda entry: (entry.kind != "gain", -abs(entry.sigma)))
-        return FoundChange(ranked[0], tuple(ranked))
+        return FoundChange(ranked[0], tuple(ranked), off=self.off(ranked))
 
 
 def with_own_light(

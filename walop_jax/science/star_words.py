@@ -29,7 +29,6 @@ DATE_IT = "walop-jax check RUN STARS... dates it; new calibration exposures meas
 LOOK = "look for dust, a ghost or a bright neighbour at that place"
 TIMES = "give MJD in every row"
 _FAR_TOO_SMALL = 5.0  # factor on N_ERR that is likelier a fault of the counts
-_NOISE = "χ²/dof of the stars is"
 _UNEXPLAINED = "a change that no camera, arm or place of the field makes"
 _WHERE = {
     "x": " at the edge of the field along +X",
@@ -70,13 +69,15 @@ class FoundChange:
     """A change since the calibration: the simplest description, and all that describe the stars alike (it included).
 
     In a survey it began at `time` (MJD, or the number of the group), or, as others describe the stars as well, at any
-    time `between` the first and the last of theirs; in a catalogue it was there always, and these are NaN.
+    time `between` the first and the last of theirs; in a catalogue it was there always, and these are NaN. `off` is
+    by how much the simplest of `alike`, of a camera if there is one, moves q or u of stars (`StarSearch.off`).
     """
 
     best: PossibleChange
     alike: tuple[PossibleChange, ...]
     time: float = np.nan
     between: tuple[float, float] = (np.nan, np.nan)
+    off: float | None = None
 
     @property
     def rivals(self) -> tuple[PossibleChange, ...]:
@@ -89,14 +90,6 @@ class FoundChange:
         names = {entry.name for entry in self.alike}
         single = len(names) == len(self.best.members) == 1 and self.best.kind != UNNAMED
         return self.best.name if single else None
-
-    @property
-    def off(self) -> float | None:
-        """By how much q or u of stars are wrong (a fraction), about; None where it is not the light of one camera.
-
-        q = (N₀ − N₁)/(N₀ + N₁) of an arm, one camera of which is brighter by β, is wrong by (1 − q²) β/2.
-        """
-        return 0.5 * self.best.relative if len(self.best.members) == 1 and self.best.relative else None
 
     def words(self) -> str:
         """The change in a sentence."""
@@ -120,7 +113,10 @@ class FoundChange:
 
 @dataclasses.dataclass(frozen=True)
 class DisagreeingPlace:
-    """A place where stars disagree: centre, size (deg), σ, stars, causes (best first): spots of these `cameras`."""
+    """A place where stars disagree: centre, size (deg), σ, stars, causes (best first): spots of these `cameras`.
+
+    `off` is by how much the best of them moves q or u of the stars there (`StarSearch.off`).
+    """
 
     x: float
     y: float
@@ -129,6 +125,7 @@ class DisagreeingPlace:
     stars: int
     alike: tuple[PossibleChange, ...]
     cameras: tuple[int, ...]
+    off: float | None = None
 
     def profile(self, x: Float[np.ndarray, " r"], y: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
         """g at field positions: 1 in the centre, 0 beyond three sizes."""
@@ -163,7 +160,8 @@ class CatalogueCheck:
     `smallest` is the gain change of the camera seen best that would be found in 99 % of cases (nan: none). `stars` and
     `rows_used` count the sample; `growth` holds the units of X, Y and time; stars of `places` disagree together; `sky`
     is the light of the sky left over (None: its level is not stated), `readings` are other readings of the rows, and
-    `own` is what q and u of the stars say of the arms (None: of few stars).
+    `own` is what q and u of the stars say of the arms (None: of few stars). `photons` is the stated error of q and u of
+    a star by noise alone (median; nan: not known).
     """
 
     stars: int
@@ -181,6 +179,7 @@ class CatalogueCheck:
     sky: LeftOverSky | None = None
     readings: CatalogueReadings | None = None
     own: OwnLightCheck | None = None
+    photons: float = np.nan
 
     @property
     def unbalanced(self) -> tuple[ArmChange, ...]:
@@ -208,8 +207,8 @@ class CatalogueCheck:
     @property
     def noise_is_off(self) -> bool:
         """True if the counts do not scatter by N_ERR."""
-        off = not 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS
-        return self.noise > residuals.NO_NOISE and self.noise_p < self.alarm and off and not self.rows_agree
+        known = self.noise > residuals.NO_NOISE and self.noise_p < self.alarm
+        return known and _matters(self.noise) and not self.rows_agree
 
     @property
     def rows_agree(self) -> bool:
@@ -238,38 +237,41 @@ class CatalogueCheck:
 
     @property
     def against(self) -> tuple[Doubt, ...]:
-        """A reason for each thing that does not hold, with its remedy; places forbid nothing."""
+        """A reason for each thing that does not hold, with its remedy; places forbid nothing.
+
+        `Doubt.off` is the shift of q or u by a change (the simplest of those alike), an arm, the sky or a place, median
+        of the stars that it acts on; and the scatter that errors lack, √(s − 1) of that of the photons, s χ² per degree
+        of freedom. It is not known, and so ranked ahead of all that is, where the counts are not those of the
+        instrument.
+        """
         if self.readings is not None and self.readings.mended:
             return (Doubt(Quality.CATALOGUE, self.readings.words(), remedy=CORRECT),)
-        texts: list[tuple[str, str]] = []
+        found: list[tuple[str, str, float | None]] = []
         odd = any(change.best.implausible for change in self.changes) and not self.unbalanced
         if self.own is not None and self.own.found:
-            texts.append((self.own.words(), DATE_IT))
+            found.append((self.own.words(), DATE_IT, self.own.off))
         elif odd:
             what = "the counts contradict the calibration by more than an instrument changes"
             question = "of this instrument, of all cameras in one unit and aperture, and in their order?"
-            texts.append((f"{what}: are they {question}", CORRECT))
+            found.append((f"{what}: are they {question}", CORRECT, None))
         if not odd:  # what follows from counts that are none of the instrument is no change, and no dust
-            plausible = (change.words() for change in self.changes if not change.best.implausible)
-            texts += [(words, DATE_IT) for words in plausible]
+            plausible = (change for change in self.changes if not change.best.implausible)
+            found += [(change.words(), DATE_IT, change.off) for change in plausible]
         if self.sky is not None and self.sky.found:
-            texts.append((self.sky.words(), "subtract the sky anew"))
+            found.append((self.sky.words(), "subtract the sky anew", self.sky.off))
         if self.rows_agree:
             assert self.rows is not None
             what = "the rows of a star agree more than independent rows do: together their variance is "
             then = f"Photon errors of stars of several rows were multiplied by {np.sqrt(self.scale[1]):.3g}"
             question = "Are rows there twice, or is their noise correlated?"
-            texts.append((f"{what}{self.rows:.3g} times N_ERR. {question} {then}", CORRECT))
+            text = f"{what}{self.rows:.3g} times N_ERR. {question} {then}"
+            found.append((text, CORRECT, _lacking(self.scale[1], self.photons)))
         if self.noise_is_off:
-            factor = np.sqrt(self.noise)
-            word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
-            instead = "" if factor < _FAR_TOO_SMALL else "the counts contradict the calibration, or "
-            text = f"{instead}N_ERR is {word}: χ²/dof of the stars together is {self.noise:.3g}. Photon errors were"
-            texts.append((f"{text} multiplied by {factor:.3g}", ERRORS))
-        places = (
-            () if odd else [Doubt(Quality.PLACE, p.words(), blocking=False, remedy=LOOK) for p in self.places]
-        )
-        return (*(Doubt(Quality.CATALOGUE, text, remedy=remedy) for text, remedy in texts), *places)
+            found.append((_errors_are_off(self.noise), ERRORS, _lacking(self.noise, self.photons)))
+        doubts = [Doubt(Quality.CATALOGUE, text, off=off, remedy=remedy) for text, remedy, off in found]
+        for place in () if odd else self.places:
+            doubts.append(Doubt(Quality.PLACE, place.words(), blocking=False, off=place.off, remedy=LOOK))
+        return tuple(doubts)
 
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each thing that does not hold."""
@@ -302,6 +304,25 @@ class CatalogueCheck:
         }
 
 
+def _errors_are_off(noise: float) -> str:
+    """What χ² per degree of freedom says of N_ERR, in a sentence."""
+    factor = np.sqrt(noise)
+    word = f"{factor:.3g} times too small" if factor > 1 else f"{1 / factor:.3g} times too large"
+    instead = "" if factor < _FAR_TOO_SMALL else "the counts contradict the calibration, or "
+    text = f"{instead}N_ERR is {word}: χ²/dof of the stars together is {noise:.3g}. Photon errors were"
+    return f"{text} multiplied by {factor:.3g}"
+
+
+def _lacking(scale: float, photons: float) -> float | None:
+    """Scatter of q and u that their errors lack where variances are so many times those of the `photons`."""
+    return float(np.sqrt(max(scale - 1.0, 0.0))) * photons if np.isfinite(photons) else None
+
+
+def _matters(noise: float) -> bool:
+    """True where χ² per degree of freedom is not what errors that are right to 5 % leave."""
+    return not 1.0 / NOISE_MATTERS < noise < NOISE_MATTERS
+
+
 NOTHING_TO_SPARE = CatalogueCheck(0, 0, 0, 1.0, 1.0, None, 1.0, (), (), np.nan)
 """Of a catalogue in which no row has a camera to spare."""
 
@@ -313,8 +334,11 @@ class Watch(Displayed):
     By exposure group: `time` (MJD, or its number), `stars`, `chi2` per degree of freedom, `gain` of every camera
     (change since the calibration, that camera alone) with `error`, and `smallest`: the step of each camera from that
     group on that would be found in 99 % of cases. `tests` histories were asked; the alarm is at `alarm` standard
-    errors. `remarks` are about rows left out; `misread` says of catalogues that they are not what they say: what
-    their stars say of the instrument means nothing, and changes are not told where any is so.
+    errors. `noise` is χ² per degree of freedom of all stars behind the changes, 1 where it is that of N_ERR; `photons`
+    as in `CatalogueCheck`. `remarks` are about rows left out, `odd` about stars that lie off alone; `misread` says of
+    catalogues that they are not what they say: what their stars say of the instrument means nothing, and changes are
+    not told where any is so. `of_catalogues` is what holds against single ones, by all that `apply` asks, where changes
+    in their course do not explain the stars.
     """
 
     cameras: tuple[str, ...]
@@ -330,11 +354,19 @@ class Watch(Displayed):
     alarm: float
     remarks: tuple[str, ...] = ()
     misread: tuple[str, ...] = ()
+    photons: float = np.nan
+    of_catalogues: tuple[Doubt, ...] = ()
+    odd: tuple[str, ...] = ()
+
+    @property
+    def noise_is_off(self) -> bool:
+        """True if the counts do not scatter by N_ERR."""
+        return _matters(self.noise)
 
     @property
     def holds(self) -> bool:
-        """True if the calibration still holds: nothing has changed, and scatter is not beyond twice N_ERR."""
-        return bool(not self.changes and self.noise < SCATTERED and not self.misread)
+        """True if calibration and errors stand."""
+        return not (self.changes or self.noise_is_off or self.misread or self.of_catalogues)
 
     @property
     def doubtful(self) -> bool:
@@ -344,19 +376,21 @@ class Watch(Displayed):
 
     @property
     def against(self) -> tuple[Doubt, ...]:
-        """The reasons against using the calibration on, each with its effect on stars and its remedy."""
-        remarks = [Doubt(Quality(0), text, blocking=False, remedy=TIMES) for text in self.remarks]
+        """A reason for each thing that does not hold, ranked as those of a catalogue (`CatalogueCheck.against`)."""
+        of_rows = [(text, TIMES) for text in self.remarks] + [(text, ERRORS) for text in self.odd]
+        remarks = [Doubt(Quality(0), text, blocking=False, remedy=cure) for text, cure in of_rows]
         if self.misread:
             misread = (Doubt(Quality.CATALOGUE, text, remedy=CORRECT) for text in self.misread)
             return (*misread, *remarks)
+        # A single exposure group has no course, and all catalogues are asked for more that may make the scatter.
+        changes = () if self.of_catalogues and len(self.time) == 1 else self.changes
         doubts = [
-            Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE)
-            for change in self.changes
+            Doubt(Quality.CATALOGUE, change.words(), off=change.off, remedy=CALIBRATE) for change in changes
         ]
-        noise = [text for text in self.warnings if text.startswith(_NOISE)]
-        unclear = not self.holds and not self.changes
-        told = [Doubt(Quality.CATALOGUE, text, blocking=unclear, remedy=ERRORS) for text in noise]
-        return (*doubts, *told, *remarks)
+        if self.noise_is_off and not self.of_catalogues:
+            off = _lacking(self.noise, self.photons)
+            doubts.append(Doubt(Quality.CATALOGUE, _errors_are_off(self.noise), off=off, remedy=ERRORS))
+        return (*doubts, *self.of_catalogues, *remarks)
 
     @property
     def stars_in_words(self) -> str:
@@ -367,14 +401,8 @@ class Watch(Displayed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for every change, and one if the counts do not scatter by N_ERR."""
-        if self.misread:
-            return (*self.misread, *self.remarks)
-        texts = (*(change.words() for change in self.changes), *self.remarks)
-        if 1.0 / NOISE_MATTERS < self.noise < NOISE_MATTERS:
-            return texts
-        factor = np.sqrt(self.noise)
-        return (*texts, f"{_NOISE} {self.noise:.3g}: N_ERR was multiplied by {factor:.3g}")
+        """A sentence for each thing that does not hold."""
+        return tuple(doubt.sentence for doubt in self.against)
 
     def document(self) -> dict[str, Any]:
         """Everything as plain data."""
@@ -399,6 +427,7 @@ class Watch(Displayed):
             "smallest_step_seen": float(np.min(self.smallest)),
             "chi2_per_dof": self.noise,
             "misread": list(self.misread),
+            "of_catalogues": [doubt.sentence for doubt in self.of_catalogues],
             "tests": self.tests,
             "alarm_sigma": self.alarm,
             "groups": groups,
@@ -430,10 +459,10 @@ class Watch(Displayed):
             seen = f"{100.0 * self.smallest[g].min():.2g}"
             rows.append((when, f"{self.stars[g]}", f"{self.chi2[g]:.2f}", *gains, seen))
         title = "The calibration is still valid"
-        if not self.holds:
-            unclear = "The stars DO NOT SHOW whether the calibration is still valid"
-            changed = self.changes and not self.misread
-            title = "The calibration IS NO LONGER VALID" if changed else unclear
+        if self.misread or self.of_catalogues or (self.noise >= SCATTERED and not self.changes):
+            title = "The stars DO NOT SHOW whether the calibration is still valid"
+        elif self.changes:
+            title = "The calibration IS NO LONGER VALID"
         smallest = two_digits(100.0 * float(np.min(self.smallest)))
         sensitivity = f"a {smallest} % step in one camera would be detected (99 % probability)"
         facts = (("exposure groups", f"{len(self.time)}"), ("sensitivity", sensitivity))
