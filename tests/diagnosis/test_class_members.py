@@ -14,11 +14,11 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
+from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import (
     Classes,
+    ClassMember,
     ClassOf,
-    Likeness,
     _with_ties,
     averaged,
     only_a_class,
@@ -119,7 +119,7 @@ def test_a_class_of_one_changes_nothing(told):
 def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     """Of three equally probable ones and e^−6.8 of that: all parameters would be smaller by what is left out."""
     result, _ = told
-    laid = Laid(class_scene.examined())
+    laid = LinearisedFit(class_scene.examined())
     sums = (((1.0, Change.parsed("gain of O1 * hours")),),)
 
     def candidates(step, addition, alike, whole):
@@ -189,8 +189,8 @@ def test_members_that_say_a_name_in_other_words_move_its_parameter(turned):
     sums = (((1.0, Change.parsed(text)),),)
     none = np.zeros((len(fit.calset.points), 6))
     members = (
-        Likeness("hwp2_axis", 0.0, sums, none, probability=0.5),
-        Likeness(
+        ClassMember("hwp2_axis", 0.0, sums, none, probability=0.5),
+        ClassMember(
             text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5
         ),
     )
@@ -242,7 +242,7 @@ def test_what_cannot_be_told_from_one_addition_is_no_member_of_the_class_of_anot
 
 def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(spotted, monkeypatch):
     """Without the spot its depth is 0, and not its size. Fits chose the spot: no member is more probable."""
-    monkeypatch.setattr(Laid, "raised", lambda laid, evidence, best: max(evidence, best))
+    monkeypatch.setattr(LinearisedFit, "raised", lambda laid, evidence, best: max(evidence, best))
     result = spotted.result
     (spots,) = ambiguities(spotted, {"blemish": [RIVAL]}).additions
     assert spots.members[0].probability >= spots.members[1].probability

@@ -165,7 +165,7 @@ def test_optics_ten_widths_beyond_their_prior_explain_nothing(monkeypatch, text,
     monkeypatch.setattr(search, "descriptions_of", lambda fit: ((change, 1.0, 0.01),))
     monkeypatch.setattr(search, "beyond_prior", lambda fit, name: {change.label: 15.0})
     trial = Trial(
-        Described, 1e4, 100.0, noise=True, fit=Mock(FitResult, converged=True),
+        Described, 1e4, 100.0, leaves_noise=True, fit=Mock(FitResult, converged=True),
         compared=FitComparison(heldout_before=2.0, heldout_after=1.0),
     )  # fmt: skip
     told = search.against(trial)

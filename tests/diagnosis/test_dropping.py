@@ -90,7 +90,7 @@ def test_what_has_no_name_is_asked_of_the_model_without_needless_names(monkeypat
         return State(evidence, steps)
 
     monkeypatch.setattr(remainder, "prune", lambda first, last, judge: state())
-    last, rest = remainder.concluded(state(), state(Trial(ZERO, 1.0, 1.0, noise=False)), Mock(Refits))
+    last, rest = remainder.concluded(state(), state(Trial(ZERO, 1.0, 1.0, leaves_noise=False)), Mock(Refits))
     assert (last.steps, rest) == ((), None)
 
 
@@ -137,7 +137,7 @@ def test_what_has_no_name_is_told_without_a_name_that_could_stand_in_for_it():
 def test_a_name_that_leaves_the_data_as_unexplained_is_told_as_a_part_and_taken_out(left, part):
     """χ²/dof 69 → 24 with the name is a part of what is missing; 69 → 1.4 is the cause of most of it."""
     compared = FitComparison(chi2_before=6900.0, chi2_after=100.0 * left)
-    step = Trial(effect_by_name("flexure"), 1.0, 1.0, noise=False, compared=compared)
+    step = Trial(effect_by_name("flexure"), 1.0, 1.0, leaves_noise=False, compared=compared)
 
     def state(chi2, *steps):
         return State(SimpleNamespace(dof=100, result=SimpleNamespace(chi2=chi2, dof=100)), steps)

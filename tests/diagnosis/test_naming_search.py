@@ -58,8 +58,8 @@ class Counting(Linear):
     def fitted(self, evidence, trial):
         self.fits.append(trial.effect.name)
         more = self.surprise.get(trial.effect.name, 0.0)
-        noise = trial.noise if not self.surprise else False
-        return dataclasses.replace(trial, evidence=trial.linear + more, noise=noise)
+        noise = trial.leaves_noise if not self.surprise else False
+        return dataclasses.replace(trial, evidence=trial.expected + more, leaves_noise=noise)
 
 
 def names(state, judge):
@@ -119,7 +119,7 @@ class Refusing(Counting):
 
     def fitted(self, evidence, trial):
         fitted = super().fitted(evidence, trial)
-        return dataclasses.replace(fitted, noise=False, predicts=trial.effect.name != self.fits[0])
+        return dataclasses.replace(fitted, leaves_noise=False, predicts=trial.effect.name != self.fits[0])
 
 
 def test_the_other_name_of_the_set_is_asked_once_the_most_probable_one_is_refused():

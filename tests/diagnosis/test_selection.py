@@ -140,6 +140,20 @@ def test_a_pattern_without_a_name_competes_with_names():
     assert not posterior.explains
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_two_names_come_before_a_pattern_that_holds_both(seed):
+    """The pattern explains most as one thing, and neither name is of use beside it; it has four numbers too many."""
+    a, b, *others = (v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((6, ROWS)))
+    columns = {
+        "clp_zero": a[:, None],
+        "rotator_zero": b[:, None],
+        "a pattern": np.stack([a, b, *others], axis=1),
+    }
+    found, *_ = scene({"clp_zero": [25.0], "rotator_zero": [-25.0]}, 200 + seed, columns, 25.0)
+    things = most_probable(found).things
+    assert sorted(getattr(thing.candidate, "name", "") for thing in things) == ["clp_zero", "rotator_zero"]
+
+
 def test_the_set_of_a_thing_holds_names_that_are_the_same_to_the_data():
     """Two columns that are equal: half of the probability each where both are equally probable beforehand."""
     rng = np.random.default_rng(1)

@@ -9,7 +9,7 @@ from small_run import SMALL
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.class_members import Laid, LinearStep
+from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep
 from walop_jax.diagnosis.class_product import Classes, averaged
 from walop_jax.diagnosis.discrepancy import (
     _Block,
@@ -120,7 +120,7 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
     shift = (other.values - result.values)[free] / size
     state = examined_with(result, drift.__eq__)
     (probe,) = (probe for probe in state.sentences if probe.name == drift)
-    laid = Laid(state)
+    laid = LinearisedFit(state)
     root = _of_other_light(laid, LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows)))
     at = state.bare.places()[probe.name]
     square = state.bare.gram[at, at].item()

@@ -187,7 +187,7 @@ ERRORS = (
     planted("diagnosis/selection.py", "scores = self.scores - along @ taken", "scores = self.scores",
             "diagnosis/test_selection.py"),
     planted("diagnosis/selection.py", "mean = -np.einsum", "mean = np.einsum", "diagnosis/test_selection.py"),
-    planted("diagnosis/search.py", "(trial.evidence - trial.linear)", "(trial.linear - trial.evidence)",
+    planted("diagnosis/search.py", "(trial.evidence - trial.expected)", "(trial.expected - trial.evidence)",
             "diagnosis/test_naming_search.py"),
     planted("diagnosis/exact.py", "information - np.diag(width**-2.0)", "information", "diagnosis/test_judging.py"),
     planted("diagnosis/trust.py", "2.0 * min(above, 1.0 - above)", "min(above, 1.0)", "diagnosis/test_trust.py"),

@@ -27,7 +27,7 @@ def test_every_rule_is_there_and_comes_back(rule: Rule):
 
 def test_a_name_that_left_out_data_speak_against_is_refused_by_one_rule_alone():
     worse = FitComparison(heldout_before=1.0, heldout_after=1.1)
-    trial = Trial(effect_by_name("blemish"), 50.0, 10_825.0, noise=False, compared=worse)
+    trial = Trial(effect_by_name("blemish"), 50.0, 10_825.0, leaves_noise=False, compared=worse)
     (rule,) = (rule for rule in RULES if rule.text.startswith("data that were left out"))
     with watched(RULES) as decided:
         assert search.against(trial).startswith("data that were left out agree worse")

@@ -1,8 +1,8 @@
 """Equivalence class of each addition of a diagnosis: candidates indistinguishable from it, and their effect on stars.
 
-Additions    effects with a name, and groups of sentences. Of each the members of its class are all candidates that, in
-             its place, are not improbable (`thresholds.IMPROBABLE`), by one linear step. Their prior probabilities are
-             equal: a name does not make a candidate more probable.
+Additions    effects with a name, and groups of sentences. The class of an addition has as members all candidates that
+             could take its place and would not be improbable there (`thresholds.IMPROBABLE`), by one linear step.
+             Their prior probabilities are equal: a name does not make a candidate more probable.
 One step     A model without some amplitudes a leaves r + D of the residuals r, D = −J_a a. Other columns K take their
              place with b = −(KᵀPK)⁺ KᵀP(r + D), and all other parameters move by −J_o⁺ (D + K b), where P projects off
              the other columns J_o. Exact where everything is linear.
@@ -30,7 +30,7 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassOf, Likeness, Sum, distinct, sentences_in
+from walop_jax.diagnosis.class_product import ClassMember, ClassOf, Sum, distinct, sentences_in
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import sentences_of
@@ -50,7 +50,7 @@ PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
-    laid: Laid, added: Mapping[str, Collection[str]], given: Collection[str] = ()
+    laid: LinearisedFit, added: Mapping[str, Collection[str]], given: Collection[str] = ()
 ) -> tuple[ClassOf, ...]:
     """The classes of what was added to a model, without those of a single member.
 
@@ -81,7 +81,7 @@ def classes_of(
 def _groups(
     effect: Described, groups: Sequence[str], given: Collection[str]
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Sentences that were added in their groups, by name; an ungrouped sentence is a group of its own."""
+    """The groups of sentences that were added, each with its name; an ungrouped sentence is a group of its own."""
     ungrouped = [text for text in effect.sentences if text not in given]
     for name in groups:
         group = tuple(text for text in ungrouped if text in name.split("; "))
@@ -91,7 +91,7 @@ def _groups(
     yield from ((text, (text,)) for text in ungrouped)
 
 
-class Laid:
+class LinearisedFit:
     """An examination laid out for one linear step from model to model.
 
     No amplitude of a plausible member is more than `largest` prior widths.
@@ -143,7 +143,8 @@ class Laid:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`.
 
         `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
-        `whole` is the group of sentences that it is what remains of; empty for an effect with a name.
+        `whole` is the group of sentences that was added, of which the addition is the part that remains; it is empty
+        for an effect with a name.
         """
         step = LinearStep(self, at, lost)
         addition, widths = step.addition(name, sums)
@@ -155,7 +156,7 @@ class Laid:
             members.append(member._replace(evidence=evidence))
         groups = self.distinct(members)
         both = [members[group[0]] for group in groups]
-        # Of equivalent members the other kinds are asked once, as of those that nothing is equivalent to.
+        # Equivalent members count once: the counterpart in other KINDs is sought for one member of each group.
         for group in groups:
             twins = (step.in_other_kinds(by_step[i], None if i else widths) for i in group)
             if (twin := next(filter(None, twins), None)) is not None:
@@ -168,21 +169,21 @@ class Laid:
         ]
         return ClassOf(name, at, tuple(chosen), *self._spread(chosen))
 
-    def distinct(self, members: Sequence[Likeness]) -> list[list[int]]:
-        """Groups of members that are equivalent in the matrix, that of the first ahead, then the most probable."""
+    def distinct(self, members: Sequence[ClassMember]) -> list[list[int]]:
+        """Groups of members that change the matrix alike: that of the first member, then the most probable first."""
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         return distinct(evidence, np.stack([member.change for member in members]), self.errors, ALIKE)
 
     def raised(self, evidence: float, best: float) -> float:
         """The evidence of a candidate that is reported as indistinguishable, within the error of a linear step.
 
-        With large residuals nothing is sure of that error: then it is as probable as the best.
+        With large residuals that error is unknown, and the candidate is taken to be as probable as the best one.
         """
         if self.state.floor > 1.0:
             return best
         return min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best)))
 
-    def _spread(self, members: Sequence[Likeness]) -> tuple[float, float, float]:
+    def _spread(self, members: Sequence[ClassMember]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
         weights = np.array([member.probability for member in members])
         away = np.stack([member.change for member in members])
@@ -211,7 +212,7 @@ class Laid:
 class LinearStep:
     """One linear step from the fit to a model without some amplitudes and with others."""
 
-    def __init__(self, laid: Laid, at: Int[np.ndarray, " a"], lost: Vector) -> None:
+    def __init__(self, laid: LinearisedFit, at: Int[np.ndarray, " a"], lost: Vector) -> None:
         self.laid, self.at = laid, at
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
@@ -219,7 +220,7 @@ class LinearStep:
         self.projector, self.basis = design.without(at)
         self.left = self.projector(design.residual + self.lost)
 
-    def addition(self, name: str, sums: tuple[Sum, ...]) -> tuple[Likeness, Vector]:
+    def addition(self, name: str, sums: tuple[Sum, ...]) -> tuple[ClassMember, Vector]:
         """The addition itself as a member, with its fitted values, and its prior widths."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
@@ -229,16 +230,16 @@ class LinearStep:
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / floor**2
-        return Likeness(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
+        return ClassMember(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
     def candidates(
-        self, addition: Likeness, alike: Collection[str], whole: frozenset[str]
-    ) -> tuple[float, list[tuple[Likeness, bool]]]:
+        self, addition: ClassMember, alike: Collection[str], whole: frozenset[str]
+    ) -> tuple[float, list[tuple[ClassMember, bool]]]:
         """The best evidence, and candidates not improbable relative to it; `alike` and `whole` as in `class_of`.
 
-        True stands beside those that are among `alike`. What the model has beside the addition replaces nothing. Of a
-        group that was added, sentences that nothing shows were dropped since: it is the whole group that is compared
-        with other groups, and the group is no member beside what remains of it.
+        Each candidate comes with True if it is among `alike`. A change that the model has already is no candidate for
+        the place of the addition. If the addition is what remains of a group, its other sentences having been dropped,
+        the evidence of the whole group is compared with that of other groups; the group itself is then no member.
         """
         state, design, texts = self.laid.state, self.laid.design, _texts(addition.sums)
         gram, scores = state.space_beside(self.basis)[1].gram, design.products(state.columns, self.left)
@@ -279,11 +280,11 @@ class LinearStep:
             members.append((self.member(probe.name, sums, column, probe.widths, evidence), close))
         return best, members
 
-    def in_other_kinds(self, member: Likeness, widths: Vector | None = None) -> Likeness | None:
-        """A member that is about exposures of one KIND, in all others instead; None for any other.
+    def in_other_kinds(self, member: ClassMember, widths: Vector | None = None) -> ClassMember | None:
+        """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
 
-        Its `evidence` is relative to that of the member. `widths` are those of the priors of the member (None: those of
-        its sentences).
+        None for a member that is not about one KIND. The `evidence` of the counterpart is given relative to that of the
+        member. `widths` are the prior widths of the member; None: those of its sentences.
         """
         kinds_by_sentence = [
             [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
@@ -312,15 +313,18 @@ class LinearStep:
             widths = np.array([amplitude[0][1].width(largest) for amplitude in sums])
         name = "; ".join(sentence.text for sentence in sentences_in(sums))
         twin = self.member(name, sums, column, widths)
-        # The same difference, seen from the other side: as probable, however its throughputs are known.
+        # It is the same difference between KINDs, told from the other side: as probable, whatever the throughputs are.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
         near = abs(twin.evidence - member.evidence) < alike
         return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
 
     def member(
         self, name: str, sums: tuple[Sum, ...], column: Matrix, widths: Vector, evidence: float | None = None
-    ) -> Likeness:
-        """The model with other amplitudes, at the minimum; `evidence` in place of that of the linear step."""
+    ) -> ClassMember:
+        """The member with the amplitudes `sums` in the place of the addition, at the minimum of that model.
+
+        `evidence`, if it is given, replaces the evidence of the linear step.
+        """
         laid, projected = self.laid, self.projector(column)
         square, along = projected.T @ projected, projected.T @ self.left
         if evidence is None:
@@ -333,11 +337,11 @@ class LinearStep:
         moved = -self.projector.taken_up(self.projector.basis.T @ change)
         values[self.rest], slopes[self.rest] = moved[:, 0], moved[:, 1:]
         at = laid.fit.model.free[self.at]
-        values[self.at] = -laid.fit.values[at] * np.isin(at, laid.amplitudes)  # its shape remains
+        values[self.at] = -laid.fit.values[at] * np.isin(at, laid.amplitudes)  # not of shapes: these stay
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
-        return Likeness(name, evidence, sums, change, amplitudes, covariance, values, slopes)
+        return ClassMember(name, evidence, sums, change, amplitudes, covariance, values, slopes)
 
     def _can_be_said(self, sums: Sequence[Sum]) -> bool:
         """True if a model can include all sentences."""

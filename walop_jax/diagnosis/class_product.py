@@ -44,7 +44,7 @@ def sentences_in(sums: Sequence[Sum]) -> list[Sentence]:
     return [sentence for amplitude in sums for _, sentence in amplitude]
 
 
-class Likeness(NamedTuple):
+class ClassMember(NamedTuple):
     """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
@@ -73,7 +73,7 @@ class ClassOf(NamedTuple):
 
     added: str
     at: Int[np.ndarray, " a"]
-    members: tuple[Likeness, ...]
+    members: tuple[ClassMember, ...]
     spread: float
     stated: float
     off: float

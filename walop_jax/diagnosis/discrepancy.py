@@ -7,22 +7,23 @@ Shape        A description without a name is the simplest one that explains the 
              f_j products of a pattern over the field (all polynomials to the third degree), a law over the exposures
              (none, those of the descriptions, other slow ones) for each kind of polarisation (`GENERATORS`; of cameras
              and other numbers the kind itself); n patterns × laws, s rms size of the descriptions of that place in the
-             data: every kind may be as large as what was described, in any shape. In a product, stars have those
-             without a dependence and with those described; others change the parameters alone. With mean c and
+             data: every kind may be as large as what was described, in any shape. In a product, stars have the
+             deviations that are the same in all exposures, and those with a law that a description has; all others
+             only shift the parameters. With mean c and
              covariance C of the amplitudes by one linear step, E[c cᵀ] = C + c cᵀ is added to the covariance; values
              stay those of the fit: of hundreds of amplitudes, the mean is mostly noise.
-Undetected   Elements that the model does not let vary have errors of 10⁻⁶, which no experiment has. Further changes of
-             polarisation δ may be there: at a place of the train, a diattenuation, retardance or depolarisation,
-             over the field of one degree d ≤ 3, with the prior widths of its kind at all `score.SCALES`. Each of these
+Undetected   With elements that the model does not let vary, the matrix has errors of 10⁻⁶, which no experiment has.
+             There may be further changes δ of polarisation: at a place of the train a diattenuation, retardance or
+             depolarisation, of one degree d ≤ 3 over the field, its prior widths at all `score.SCALES`. Each of these
              n groups g is there or not, with a probability π = 1/n beforehand: one change is expected. By the
              evidence B_g of one linear step,
                  E[δδᵀ] = Σ_g p_g (C_g + c_g c_gᵀ),   p_g = π B_g / (1 − π + π B_g)
-             is added to the covariance; values stay those of the fit. Changes that data exclude add nothing, those
-             without any trace in them their prior, those suggested without an alarm their size. One more is expected
-             among the candidates of the examination that stars do not have (in time, temperature, KIND, counts, single
-             exposures): it moves the parameters alone.
-Starlight    Any such change acts on a star, to first order, as one ahead of the train does: few of these, chosen one
-             after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
+             is added to the covariance; values stay those of the fit. A change that the data exclude adds nothing; one
+             of which the data say nothing adds its prior variance; one that they suggest without an alarm adds its
+             size. One more change is expected among the candidates that act on calibration exposures and not on stars
+             (in time, temperature, KIND, counts, single exposures): it only shifts the parameters.
+Starlight    To first order any such change acts on a star like a change ahead of the train. A few changes there, chosen
+             one after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
              models that were not chosen, Draper 1995, J. R. Stat. Soc. B 57, 45
 Limits       First order; in the usual setting of the plates. Undetected changes of finer structure are not in it.
@@ -40,7 +41,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import of_matrix
-from walop_jax.diagnosis.class_members import Laid, LinearStep, classes_of
+from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, Shape, Sum
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
@@ -72,7 +73,7 @@ def ambiguities(
     """
     if not state.result.model.template.cameras.pairs:
         return Classes()
-    laid = Laid(state)
+    laid = LinearisedFit(state)
     return Classes(
         additions=classes_of(laid, added, given),
         shape=shape_of(laid) if added else None,
@@ -80,7 +81,7 @@ def ambiguities(
     )
 
 
-def _slopes(laid: Laid, sums: Sequence[Sum], values: Matrix) -> Float[np.ndarray, "p m a"]:
+def _slopes(laid: LinearisedFit, sums: Sequence[Sum], values: Matrix) -> Float[np.ndarray, "p m a"]:
     """Slopes of the elements of the matrix in amplitudes, which change the free parameters by `values` as well."""
     vectors, added = laid.added(sums)
     direct = of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), laid.template.cameras.pairs)
@@ -90,7 +91,7 @@ def _slopes(laid: Laid, sums: Sequence[Sum], values: Matrix) -> Float[np.ndarray
 # ------------------------------------------------------------------------------ deviations from a description
 
 
-def shape_of(laid: Laid) -> Shape | None:
+def shape_of(laid: LinearisedFit) -> Shape | None:
     """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
     if FreeForm.name in laid.fit.model.effect_names:  # it has every shape
         return None
@@ -104,11 +105,11 @@ def shape_of(laid: Laid) -> Shape | None:
     moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
     slopes = _slopes(laid, sums, member.slopes)
     between = slopes @ moment @ np.swapaxes(slopes, 1, 2)
-    # At another temperature stars have terms that are zero in the usual setting.
+    # Terms that are zero in the usual setting act on stars at another temperature: look at the steady part.
     steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
     _, at_any = laid.added([((1.0, change),) for change in steady])
     acting = np.abs(at_any).max(axis=(0, 1, 2)) > 0
-    # Of other dependences than those described stars have none: each is a program's worth of derivatives.
+    # Stars get no dependence that no description has: each one would cost a program of derivatives.
     on_stars = tuple(
         j for j, c in enumerate(changes) if acting[j] and c.applies_to_catalogue and c.beside_field in laws
     )
@@ -163,9 +164,9 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vec
 def _shapes(
     place: _Place, laws: Sequence[tuple[str, ...]], fit: FitResult, columns: Columns
 ) -> Iterator[Sentence]:
-    """All changes of a place with some laws, and other slow ones, that the model can include.
+    """All changes at a place that the model can include: patterns over the field with `laws`, and other slow ones.
 
-    Steady gains are those of the throughput; other steady numbers have the first four patterns.
+    Steady gains are left out: the throughput has them. Other steady numbers of cameras have the first four patterns.
     """
     exposures, template = fit.calset.exposures, fit.model.template
     over_field = len(fit.calset.points) >= FEWEST_POINTS
@@ -192,7 +193,7 @@ class _AtData(InExposures):
 
     @classmethod
     def of(cls, columns: Columns) -> Self:
-        """Those of a likelihood."""
+        """The (point, exposure) pairs of a likelihood."""
         points, plan = columns.likelihood.calset.points, columns.plan
         wavelength = columns.wavelength[np.asarray(plan.band_of)[:, 0]]
         return cls(
@@ -223,8 +224,8 @@ class _Block(NamedTuple):
     slopes: Matrix
 
 
-def undetected(laid: Laid) -> Shape | None:
-    """Covariance of changes that the data would not show, as one of changes ahead of the train; None without any."""
+def undetected(laid: LinearisedFit) -> Shape | None:
+    """Covariance of undetected changes, expressed by changes ahead of the train; None if there are no such changes."""
     if not (places := _steady_places(laid)):
         return None
     step = laid.nothing_removed
@@ -253,7 +254,7 @@ def undetected(laid: Laid) -> Shape | None:
     return Shape(acting, covariance, ahead.slopes[:, chosen], tuple(range(len(chosen))), spread, laid.stated)
 
 
-def _steady_places(laid: Laid) -> list[tuple[str, str]]:
+def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
     """Places of the train, that ahead of it first, whether or not exposures show it."""
     bare = dataclasses.replace(laid.template, effects=())
     places = list(itertools.chain(*places_of(bare, laid.fit.calset.exposures)))
@@ -261,7 +262,7 @@ def _steady_places(laid: Laid) -> list[tuple[str, str]]:
     return [*front, *(place for place in places if place not in front)]
 
 
-def _block(laid: Laid, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
+def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
     """The undetected changes of a place; None of a place that has none."""
     over_field = len(laid.fit.calset.points) >= FEWEST_POINTS
     changes, degrees = list[Sentence](), list[tuple[str, int]]()
@@ -303,7 +304,7 @@ def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
 
 
 def _odds(groups: int) -> float:
-    """ln of the prior odds of one scale of one of some groups against its absence."""
+    """ln of the prior odds of one of `groups` groups being there at one given scale, against its absence."""
     prior = EXPECTED / max(groups, 2)
     return float(np.log(prior / (1.0 - prior) / len(SCALES)))
 
@@ -318,11 +319,11 @@ def _second_moment(gram: Matrix, scores: Vector, widths: Vector, odds: float, fl
     return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
 
 
-def _of_other_light(laid: Laid, step: LinearStep) -> Matrix:
-    """A factor of the covariance of the free parameters by undetected changes of calibration exposures alone.
+def _of_other_light(laid: LinearisedFit, step: LinearStep) -> Matrix:
+    """F, with F Fᵀ the covariance of the free parameters by undetected changes that act on no star.
 
     These are the candidates of an examination that depend on time, temperature, KIND, counts or an exposure, or that
-    are no light of a star.
+    do not change the light of a star.
     """
     state, count = laid.state, len(laid.fit.model.free)
     absent = [probe for probe in state.asked if _no_starlight(probe, laid.template)]

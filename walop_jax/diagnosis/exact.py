@@ -7,14 +7,14 @@ Evidence       Laplace: ln B = ½ (O_base − O_g) − ½ (ln det H_g − ln det
 Other descriptions of the instrument are tried where a fit explains nothing:
 
 1. Every change that the instrument has a place for (`model/alternatives.py`) is put into the residuals at two places,
-   the fitted values and the start values: a description that is badly wrong has bent the fit. What the free parameters
-   could absorb of them, at the slopes of the description given, is projected out, priors included (one Gauss–Newton
-   step). Nothing is fitted; a sample of the field points is enough.
-2. The few that leave least are fitted, all parameters with them, and other curves of dispersion in any case: plates
-   grow to make up for those, by more than one step can tell. Their evidence against the description given is half
-   the gain in χ² less the logarithm of the number of changes that were looked at.
-3. A change that gained nothing is not compared again once names have joined the model: these explain a part of the
-   misfit, and leave less for it to explain.
+   the fitted values and the start values, since a description that is badly wrong has bent the fit. The part of the
+   residuals that the free parameters could absorb is projected out: one Gauss–Newton step with the slopes of the given
+   description, priors included. Nothing is fitted; a sample of the field points is enough.
+2. The few changes that leave least are fitted together with all parameters. Other curves of dispersion are always
+   fitted: plates change their thickness to make up for a wrong curve, which one step cannot show. The evidence of a
+   change against the given description is half its gain in χ² less the logarithm of the number of changes compared.
+3. A change that gained nothing is not compared again once names have joined the model: the names explain a part of the
+   misfit, and leave less for the change to explain.
 """
 
 from __future__ import annotations
@@ -49,22 +49,26 @@ from walop_jax.model.specification import Model
 class Trial:
     """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
-    `item` is its linear step, `linear` the evidence of that (NaN where there was none), `score` and `p_value` are those
-    of the linear test when it was added. `fit` is None until it has been fitted. `alternatives` are other shapes of the
-    effect that do as well, in words. `rivals` are effects that it may be as well, `nameless` descriptions, and
-    `probability` is that of its name among all of these. `predicts` is False where its linear step does not predict
-    held-out data, `compared` are the fits without and with it (`refits.before_and_after`), `against` the KINDs of
-    exposures that contradict it, `refused` the reason for which it was not added, `groups` the groups of sentences that
-    were added one after the other, each with the candidates that were as good then. `also` are the other names of it
-    and of what is beside it (`synonyms`).
+    item, expected   its linear step, and the evidence that a fit should find by it (None, NaN: it has none)
+    fit              its fit; None until it has been fitted
+    alternatives     other shapes of the effect that explain the data as well, in words
+    rivals, nameless  effects, and descriptions, that the addition may be instead
+    probability      that it has this name and none of `rivals` and `nameless`
+    predicts         False if its linear step does not predict held-out data
+    compared         the fits without and with it (`refits.before_and_after`)
+    against          KINDs of exposures that contradict it
+    refused          the reason for which it was not added
+    score, p_value   of the linear test at the time when it was added
+    groups           groups of sentences added one after the other, each with the candidates that were as good then
+    also             other names (`synonyms`) of the trial, and of its `nameless` rivals
     """
 
     effect: EffectKind
     evidence: float
-    left: float
-    noise: bool
+    remaining: float
+    leaves_noise: bool
     item: Ranked | None = None
-    linear: float = float("nan")
+    expected: float = float("nan")
     fit: FitResult | None = None
     alternatives: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
@@ -107,7 +111,7 @@ class Trial:
 def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
 
-    Priors of amplitudes are those of the fit at all `SCALES`.
+    Amplitudes are averaged over all `SCALES` of their prior widths.
     """
     base_names, model = set(base.model.names), extended.model
     widths = [
@@ -125,10 +129,11 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
 
 
 def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarray, " t"] = SCALES) -> float:
-    """ln B of some parameters against their prior means: density of posterior and prior there, both Gaussian.
+    """ln B of the model with parameters `at` free against the model that holds them at their prior means.
 
-    The Savage–Dickey ratio of nested models (Dickey 1971, Ann. Math. Stat. 42, 204), with the prior at all `scales`:
-    the information of the data alone is that of the posterior less that of the prior.
+    It is the Savage–Dickey ratio of nested models: density of the prior over density of the posterior, both Gaussian,
+    at the prior means (Dickey 1971, Ann. Math. Stat. 42, 204), averaged over prior widths times `scales`. The
+    information of the data alone is that of the posterior less that of the prior.
     """
     if not at:
         return 0.0
@@ -143,8 +148,8 @@ def try_effect(
 ) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again.
 
-    Sentences join those that the model has. It shares the prior of one name with all of its `prior_shapes`. The other
-    parameters start at their fitted values, or at `start`: a model that is far off has bent them.
+    Sentences join those that the model has. The prior of the name is divided among its `prior_shapes` shapes. The other
+    parameters start at their fitted values, or at `start`, if the misfit of the model has bent the fitted ones.
     """
     if isinstance(instance, Described):
         model = with_sentences(base.model, instance, base.calset)
@@ -216,8 +221,8 @@ def amplitude_positions(model: Model, name: str) -> list[int]:
 def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], name: str) -> Model:
     """The model with the priors of strongly deviating amplitudes widened to one width at the fitted value.
 
-    A prior says how large such an effect usually is. One that the data refute would go on pulling at the value and
-    count the square of its distance as a misfit, of data that are explained to within the noise.
+    A prior says how large such an effect usually is. A prior that the data refute would go on pulling at the value, and
+    its pull would count as a misfit although the data are explained to within the noise.
     """
     for i in amplitude_positions(model, name):
         mean, width = model.parameters[i].prior  # type: ignore[misc]
@@ -228,7 +233,10 @@ def with_refuted_priors_widened(model: Model, values: Float[np.ndarray, " n"], n
 
 
 def beyond_prior(result: FitResult, name: str) -> dict[str, float]:
-    """Amplitudes of an effect that lie beyond the prior of their declaration, widened or not, in its widths."""
+    """Amplitudes of an effect more than `PRIOR_EDGE` declared prior widths from their prior mean, and how many widths.
+
+    The declared widths count, even where the model has widened a prior.
+    """
     effect = result.model.template.effect(name)
     expected, far = effect.prior_widths(context_of(result)), {}
     for i in amplitude_positions(result.model, name):
@@ -246,7 +254,7 @@ def context_of(result: FitResult) -> Context:
 
 
 def evidence_of_presence(result: FitResult, name: str) -> float:
-    """ln B of a fitted model against the one without an effect: the density that prior and posterior have at neutral.
+    """ln B of a fitted model against the same model without an effect, from prior and posterior density at neutral.
 
     Infinite for an effect without parameters.
     """
@@ -305,9 +313,10 @@ def other_descriptions(
     all_of_them: bool = True,
     earlier: Mapping[str, Choice] | None = None,
 ) -> tuple[list[Trial], dict[str, Choice]]:
-    """Changes of the description of a fit, by name: all are compared, the best of them fitted while `fits` allows.
+    """Fits of other descriptions of the instrument, and all comparisons (`Choice`) by the text of the change.
 
-    `earlier` are those that were compared before the last names joined the model.
+    All changes are compared, and the best of them fitted as long as `fits()` is true. `earlier` are comparisons made
+    before the last names joined the model.
     """
     template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
     if OtherDescription.name in result.model.effect_names:
@@ -315,7 +324,7 @@ def other_descriptions(
     else:
         hopeless = {choice.change for choice in (earlier or {}).values() if not choice.gains}
     curves = other_curves(template)
-    # What is turned, exchanged or left out changes the light by per cents: nothing of that kind is a small misfit.
+    # An element turned, exchanged or left out changes the light by per cents: it explains no small misfit.
     sentences = tuple(alternatives(template)) if all_of_them else curves
     asked = [sentence for sentence in sentences if sentence not in hopeless]
     if not asked:
@@ -344,10 +353,13 @@ def other_descriptions(
 
 
 def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Choice, float, Vector]]:
-    """Every effective change with its residual fraction, gain in χ² and starting values: the better of two."""
+    """Every change that alters the residuals: as a `Choice` with the fraction left, its gain in χ², its start values.
+
+    Of fitted values and start values of the model the better ones are taken.
+    """
     point_limit = max(1, CHOICE_ROWS // max(len(result.calset.exposures), 1))
     calset = thinned(result.calset, point_limit, neighbours=1)
-    start = result.model.start.copy()  # but effects as they have been fitted
+    start = result.model.start.copy()  # start values, but fitted ones for effects
     for name in result.model.effect_names:
         start[result.model.positions(name)] = result.values[result.model.positions(name)]
     likelihood = Likelihood.of(calset, result.model)

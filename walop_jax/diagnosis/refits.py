@@ -84,10 +84,10 @@ class Refits:
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, shapes)
-        return dataclasses.replace(refitted, item=item, linear=trial.linear)
+        return dataclasses.replace(refitted, item=item, expected=trial.expected)
 
     def _with_best_times(self, evidence: Examination, description: Described) -> Described:
-        """A description that starts or stops in time, where it explains most by linear steps; any other as it is."""
+        """A description, its start or stop (if it has one) at the time that explains most by linear steps."""
         ((change, amplitude), *further) = description.terms()
         result = evidence.result
         for end in (0, 1) if not further else ():
@@ -100,13 +100,20 @@ class Refits:
         return description if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
-        """True if a sentence predicts held-out data by its linear step: it has no name that would support it."""
+        """True if the linear step of a sentence predicts held-out data.
+
+        Effects of the catalogue are not asked: their names support them.
+        """
         single = any("exposure" in text for text in sentences_of(item.probe))
         column = [evidence.candidates[item.probe.name]]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
     def others(self, state: State) -> tuple[list[Trial], Mapping[str, Choice]]:
-        """The instrument described otherwise; where the model is far off in all ways, and structural effects."""
+        """Trials of other descriptions of the instrument, and all that were compared.
+
+        Where the fit is poor (`Evidence.poor`) all descriptions are compared, and structural effects are tried as well;
+        else other curves of dispersion alone.
+        """
         result, trials = state.evidence.result, list[Trial]()
 
         def allowed() -> bool:
@@ -122,12 +129,15 @@ class Refits:
         return [*trials, *described], {**state.choices, **compared}
 
     def with_causes(self, state: State, effects: Sequence[Effect]) -> State:
-        """The state with discrete causes of what was missing: fitted from the model as designed, and added."""
+        """The state with discrete causes (`discrete`) added, each fitted from the start values of the model.
+
+        A cause whose fit does not converge, or raises χ², is left out.
+        """
         for effect in effects:
             result = state.evidence.result
             self.tell(f"fitting {getattr(effect, 'change', '') or effect.name}")
             trial = try_effect(result, effect, start=result.model.start)
-            if trial.fit is None or not trial.fit.converged or trial.left > state.evidence.chi2:
+            if trial.fit is None or not trial.fit.converged or trial.remaining > state.evidence.chi2:
                 continue
             trial = self.confronted(state.evidence, trial)
             p, reason = (
@@ -139,7 +149,7 @@ class Refits:
         return state
 
     def confronted(self, evidence: Examination, trial: Trial) -> Trial:
-        """A trial with the exposures and places left out of its fit, and the evidence of each KIND against it."""
+        """A trial with its test against held-out exposures or places, and the KINDs of exposures that contradict it."""
         assert trial.fit is not None
         after = Design.of(trial.fit)
         compared = before_and_after(trial.effect.name, evidence.design, after)
@@ -149,7 +159,7 @@ class Refits:
         return dataclasses.replace(trial, compared=compared, against=against)
 
     def adopted(self, state: State, trial: Trial) -> State:
-        """The state with the model of a trial, fitted again where priors or errors were in its way."""
+        """The state with the model of a trial; fitted again if a prior is refuted or errors were scaled (`settled`)."""
         assert trial.fit is not None
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
@@ -160,7 +170,7 @@ class Refits:
             compared = before_and_after(name, evidence.design, Design.of(result))
         item = trial.item or next((r for r in evidence.ranked if r.effect is trial.effect), None)
         table = evidence.table
-        score = item.score.statistic if item else evidence.chi2 - trial.left
+        score = item.score.statistic if item else evidence.chi2 - trial.remaining
         p_value = table.corrected(item.score) if item else table.p_global
         steps = [step for step in state.steps if step.effect is not trial.effect]
         # A further change of the description joins those before.
@@ -181,7 +191,10 @@ class Refits:
 
 
 def settled(result: FitResult, names: Collection[str]) -> FitResult:
-    """A fit with errors as given where they need not be scaled any more, and the refuted priors of effects widened."""
+    """The fit made again, its errors scaled only if they still must be, and with refuted priors of effects widened.
+
+    A fit whose errors are as given, without refuted priors, comes back as it is.
+    """
     if result.noise_scale > 1.0:
         result = fit(result.likelihood, start=result.values)
     model = result.model
@@ -198,11 +211,11 @@ def without(result: FitResult, name: str, remaining: Collection[str]) -> FitResu
 
 
 def contradicting(before: Design, after: Design) -> str:
-    """KINDs of exposures that all others predict worse with the additions of a fit; empty: none.
+    """KINDs of exposures that the exposures of all other KINDs predict worse with the additions of a fit; empty: none.
 
-    Worse is both less probable and farther off, by χ² of the prediction: one that has only become broader contradicts
-    nothing. Polariser, Moon and standards see one instrument: what is true makes none of them less probable given the
-    others.
+    Worse means that ln p and χ² of the prediction have both become worse: a prediction that is only broader contradicts
+    nothing. Exposures of polariser, Moon and standards see the same instrument, so that a true addition makes none of
+    the KINDs less probable, given the others.
     """
     kinds = before.fit.calset.exposures.kind[before.exposure]
     names = np.unique(kinds)
@@ -214,9 +227,10 @@ def contradicting(before: Design, after: Design) -> str:
 
 
 def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> list[Trial]:
-    """The steps as they lead, one after the other, from one fit to another that has no effects beside theirs.
+    """The steps compared anew (`compared`), one after the other from the fit `start` to the fit `end`.
 
-    The models between the two are fitted again; what belongs to the discovery of an effect stays.
+    `end` has the effects of the steps and no others. The models between the two are fitted again. What a step says of
+    its discovery (score, p, rivals) stays.
     """
     fits = [end.fit] if steps else []
     for step in reversed(steps[1:]):
@@ -252,7 +266,7 @@ def before_and_after(name: str, before: Design, after: Design) -> FitComparison:
 
 
 def _of_one_fold(design: Design, name: str) -> bool:
-    """True of an effect with an amplitude that only exposures of one fold show: others do not predict these."""
+    """True if a single fold of exposures shows an amplitude of the effect: other folds cannot predict it."""
     at = design.columns_of(design.fit.model.positions(name))
     square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
     of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
@@ -264,14 +278,13 @@ def predicts_unseen(
 ) -> bool:
     """True if terms without a name predict states and parts of the field that they have not seen.
 
-    One Gauss–Newton step of everything, with and without the terms, from all data but those of a unit gives the
-    density of that unit, ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ): it is broad where the step leaves it
-    open, and s² is the χ²/dof that a model leaves, 1 or more. Units are states (exposures that differ in nothing but
-    the filter; not where the terms are about single ones), and the cells of the field, where there are several. The
-    mean gain must exceed `least` times its standard error over the units, for both: a term that only follows what each
-    setting of an element does by itself predicts the field, and no other setting. Nor must it bend the rest of the
-    model: the mean of dᵀd over the states must not grow, where a density may become more probable by being broader
-    alone.
+    Each unit of the data is left out in turn. One Gauss–Newton step of all parameters from the other data, with and
+    without the terms, predicts the unit with the density ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ), which is
+    broad where the other data do not determine it; s² is χ²/dof of the model, 1 or more. Units are cells of the field,
+    if there are several, and states: exposures that differ in nothing but the filter (left out if the terms are about
+    single exposures). The mean gain in ln p must exceed `least` standard errors for cells and for states: a term that
+    follows each setting of an element by itself predicts other places, but no other setting. The mean of dᵀd over the
+    states must not grow either: a term that bends the rest of the model may gain in ln p only by a broader density.
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
@@ -295,13 +308,13 @@ def predicts_unseen(
 
 
 def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[np.ndarray, "2 u"]:
-    """Gain in ln p of each unit of the data rows, as all others predict it, of one model over another, and −½ Δχ².
+    """How much better the model `after` predicts each unit of the data rows from all others than `before`.
 
-    χ² is that of the prediction, in both models with the errors of that which leaves less scatter. The gains of a unit
-    and of all others by themselves add up to the evidence.
+    First row: gain in ln p; second row: −½ Δχ² of the prediction, for both models with the errors of the model that
+    leaves less scatter. The gain of a unit and the gain of all other units by themselves add up to the evidence.
 
-    Of each model the Jacobian, the residuals at its minimum, priors last, its degrees of freedom, and the factor on the
-    errors in whose units the data rows are.
+    A model is given as its Jacobian, its residuals at the minimum (rows of priors last), its degrees of freedom, and
+    the factor on the errors that is in the data rows.
     """
     count, densities, squares, scales = np.unique(unit, return_counts=True)[1], [], [], []
     for rows, residual, free, noise in (before, after):
@@ -313,7 +326,7 @@ def gains_of_units(unit: np.ndarray, before: LaidOut, after: LaidOut) -> Float[n
 
 
 class _Predicted(NamedTuple):
-    """Units of data rows as all the others predict them: ln p, χ² in units of the stated errors, squared distance.
+    """Every unit of the data rows, predicted from all others: ln p, χ² by the stated errors, squared distance.
 
     `scale` is the χ²/dof that the model leaves, 1 or more.
     """

@@ -41,8 +41,8 @@ Remainder = tuple[State, Unexplained | None]
 def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
-    A model that predicts exposures worse than the first one is not adopted, a free-form term included. More
-    descriptions than `thresholds.MOST_SENTENCES` count as a single cause that none of them describes: they become the
+    A model that predicts exposures worse than the first model is not adopted, with a free-form term or without. More
+    descriptions than `thresholds.MOST_SENTENCES` are taken as one cause that none of them describes; they become the
     remainder.
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
@@ -75,7 +75,7 @@ def prune(first: State, state: State, judge: Refits) -> State:
 def _needed(
     result: FitResult, steps: tuple[Trial, ...], judge: Refits
 ) -> tuple[FitResult, tuple[Trial, ...]]:
-    """A fit without additions that are not worth `thresholds.LEAST_EVIDENCE` to it, and the others."""
+    """A fit without the additions that are worth less than `thresholds.LEAST_EVIDENCE`, and the additions that stay."""
     while steps and len(result.model.template.effects) > 1:
         worth = {step.effect.name: evidence_of_presence(result, step.effect.name) for step in steps}
         least = min(worth, key=lambda name: worth[name])
@@ -127,7 +127,7 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
         reduced, steps = _needed(with_term, state.steps, judge)
         if reduced is with_term:
             return judge.adopt(state, reduced, steps), remainder
-        # These names were stand-ins for an unidentified effect: its remainder without them.
+        # Beside the free-form term some names are not needed: they imitated an unidentified effect. Again without them.
         bare = without(reduced, FreeForm.name, [step.effect.name for step in steps])
         state = _refitted(first, state, bare, steps, judge)
 
@@ -135,8 +135,8 @@ def _leftover(first: State, state: State, judge: Refits) -> Remainder:
 def _parts(first: State, state: State) -> dict[str, str]:
     """Names that leave a poor fit nearly as poor, with what each of them explains in words.
 
-    Such a name explains no more than it can borrow from missing effects, and the matrix between the points is worse
-    with it. Other descriptions of the instrument stay: they have no amplitude that could bend.
+    Such a name imitates a part of the missing effects, and makes the matrix between the field points worse. Other
+    descriptions of the instrument stay: they have no amplitude that could adapt itself to what is missing.
     """
     results, freedom = (state.evidence.result, first.evidence.result), max(first.evidence.dof, 1)
     remaining, missing = (result.chi2 / max(result.dof, 1) - 1.0 for result in results)
@@ -162,7 +162,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
             blocks.pop(block, None)
     if FreeForm.name in result.model.effect_names or not blocks or judge.over(state.fits):
         return remainder, None
-    # A block has all patterns of its kind: those that are not needed cost errors as well.
+    # A block has all patterns of its kind, and those that are not needed make errors larger as well.
     terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
     design = evidence.design
     useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
@@ -214,9 +214,9 @@ def _worse(first: Examination, state: State) -> str:
     """Data that the final model predicts worse than the first, in words; empty: none."""
     if kinds := contradicting(first.design, state.evidence.design):
         return f"exposures of {kinds}, as all others predict them"
-    if not state.steps:  # numbers of a free-form term for single exposures predict no others
+    if not state.steps:  # only a free-form term: its numbers for single exposures predict no other exposure
         return ""
-    # A number for every exposure predicts no exposure that is left out, but places in the field.
+    # An effect with a number for each exposure cannot predict an exposure that is left out, only places of the field.
     schemes = [step.compared.heldout_scheme for step in state.steps]
     scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
     before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
@@ -261,12 +261,13 @@ _FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of 
 
 
 def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterator[str]:
-    """A sentence on stated conditions, each of which, if wrong, explains the data as well as a model with `chi2` does.
+    """A remark that lists numbers that the set states, each of which, if wrong, explains the data as well as names.
 
-    `design` is of the fit before anything was added to its model, `conditions` are its `condition_scores`.
+    `chi2` is that of the fit with names, `design` that of the fit before anything was added, `conditions` are the
+    `condition_scores` of `design`. Without such a number there is no remark.
     """
     scored = [item for item in conditions.testable if abs(item.score.amplitudes[0]) < item.stated.width]
-    errors = design.fit.noise_scale**2  # of the scores; those of `chi2` are as given
+    errors = design.fit.noise_scale**2  # scores are in scaled errors, `chi2` is in errors as given
     square = float(np.sum(design.projector(design.residual) ** 2))
     least = special.chdtri(1, local_p(thresholds.ALARM, len(scored)))
     gains = [float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) for item in scored]
@@ -281,7 +282,7 @@ def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterat
 def beside_conditions(
     first: State, state: State, remainder: Unexplained | None, conditions: Singles
 ) -> Remainder:
-    """The end of a search, or the first state where a number that the set states explains more than names do."""
+    """The outcome of a search; the first state instead if one number that the set states explains more than names."""
     fits = first.evidence.result, state.evidence.result
     stated, explained = instead_of_names(conditions, *fits) if conditions.items else ("", False)
     if not stated:
@@ -295,9 +296,9 @@ def beside_conditions(
 
 
 def instead_of_a_search(first: State, conditions: Singles) -> Unexplained | None:
-    """The remainder of a gross misfit that a number which the set states explains, if it is wrong; None: there is none.
+    """The remainder, if one number that the set states, were it wrong, explained a gross misfit; None: no number does.
 
-    Nothing is searched for then: one number that turns such residuals into noise is what happened.
+    No search follows then: a single number that turns such residuals into noise is taken as the cause.
     """
     stated = number_alone(first.evidence.result, conditions)
     return wrong_number(first, stated) if stated else None
@@ -314,7 +315,7 @@ _WRONG = "a number that the set states is wrong"
 def number_alone(result: FitResult, conditions: Singles) -> str:
     """The number that a set states which, if it is wrong, turns the residuals of a fit into noise; empty: none.
 
-    Fitted are those that explain most of the misfit by a linear step.
+    Only numbers that explain more than `thresholds.GOOD_SHARE` of the misfit by a linear step are fitted.
     """
     missing = (result.chi2 - result.dof) / result.noise_scale**2
     most = [
@@ -329,15 +330,15 @@ def number_alone(result: FitResult, conditions: Singles) -> str:
 
 
 def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -> tuple[str, bool]:
-    """The number that the set states which, if wrong, explains the data better than names do; empty: none.
+    """The stated number that, were it wrong, explained the data better than names do, and whether it leaves only noise.
 
-    And whether it leaves nothing but noise.
+    The number comes in words, empty if there is none; numbers that are as probable are named together. `conditions` are
+    the `condition_scores` of `before`. If nothing was added (`after` is `before`), only a number that explains the data
+    is named.
 
-    `conditions` are the `condition_scores` of `before`. Numbers that are as probable are reported together. Where
-    nothing was added (`after` is `before`) only what explains the data is reported.
-
-    Compared are the evidence of the names, ln B of `after` against `before`, and that of the number, fitted exactly,
-    with its width as prior: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃). One number may so come before sixteen.
+    The evidence of the names, ln B of `after` against `before`, is compared with the evidence of the number, which is
+    fitted exactly: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃), w its prior width. So one number may be preferred to sixteen
+    amplitudes that fit a little better.
     """
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
@@ -345,7 +346,7 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
     for current in conditions.clear[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
-        for _ in range(_ROUNDS):  # Gauss and Newton: hours are no small step
+        for _ in range(_ROUNDS):  # Gauss–Newton steps: a clock wrong by hours is not in the linear range
             size += float(current.score.amplitudes[0])
             if abs(size) >= stated.width:  # a latitude beyond the pole, a negative temperature
                 break

@@ -1,13 +1,13 @@
 """The search for missing effects: while something is missing, the most probable name of it is fitted and added.
 
 1. `selection` says how many things are missing, and which names each of them may have, by linear steps from the fit.
-2. The names of the thing with the most evidence are fitted, the most probable first, until one of them is, with what
-   its fit found beyond the linear step, more probable than every name that was not fitted.
-3. Where the model is far off and no name explains half of that, or none is left, what cannot be differentiated
-   competes with the names: structural effects and other descriptions of the instrument (`Refits.others`).
-4. The most probable that data which took no part in its fit confirm joins the model, and the residuals are scored
-   again. Of a thing none of whose names is confirmed the next one is asked, unless a pattern describes it best: what is
-   weaker would be fitted without it, and imitate it.
+2. The names of the thing with the most evidence are fitted, the most probable first. That ends when the fit of a name
+   leaves it more probable than every name that is not fitted yet is by its linear step.
+3. Where the model is far off and no name explains half of the misfit, or where no name is left, changes that have no
+   derivative compete with the names: structural effects and other descriptions of the instrument (`Refits.others`).
+4. The most probable name that held-out data confirm joins the model, and the residuals are scored again. If no name of
+   a thing is confirmed, the next thing is tried, unless the first one is best described by a pattern: a weaker thing
+   would then be fitted to a model that lacks the stronger one, and imitate it.
 
 All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `Judge` says
 what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps (`tests/diagnosis/linear_judge.py`).
@@ -61,8 +61,8 @@ class Round:
 class State:
     """A search at one moment: the evidence of the current model, the additions so far, and why there are no others.
 
-    `choices` are other descriptions of the instrument that were compared, `fits` counts exact fits of additions,
-    `ended` says after how much the search was broken off (empty: it was not).
+    `choices` are other descriptions of the instrument that were compared, `fits` counts exact fits of additions.
+    `ended` says after how much work the search was broken off ("40 fits"); empty: it was not broken off.
     """
 
     evidence: Any
@@ -77,10 +77,10 @@ Judge = Any
 """Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone:
 
 over        amount of work after which nothing further is tried, in words; empty: there is more to spend
-fitted      a linear trial as the judge finds it
-others      trials of effects without a linear step, and other descriptions of the instrument that were compared
-confronted  a trial with what data that took no part in its fit say of it
-adopted     the state once a trial has joined the model
+fitted      a trial that has a linear step, with what the judge finds for it: Refits fits it exactly
+others      trials of effects without a linear step, and the other descriptions of the instrument that were compared
+confronted  a trial with its test against held-out data
+adopted     the state after a trial has joined the model
 """
 
 
@@ -119,7 +119,8 @@ def against(trial: Trial) -> str:
 def _far_beyond(trial: Trial) -> str:
     """An amplitude of an optical description so far beyond its prior that it explains nothing, in words; empty: none.
 
-    Optics that are off by so much are another arrangement. A camera may be: its gain steps where something breaks.
+    Optics that deviate by so much are another arrangement of the elements. A camera may deviate by so much: its gain
+    steps when something breaks.
     """
     if trial.effect is not Described or trial.fit is None:
         return ""
@@ -135,12 +136,12 @@ def _far_beyond(trial: Trial) -> str:
 
 
 def linear_trial(evidence: Evidence, item: Ranked) -> Trial:
-    """Trial of one candidate by its linear step; `linear` is the expected result of a fit, with its errors."""
+    """Trial of one candidate by its linear step; `expected` is the evidence that a fit should find, with its errors."""
     noise, statistic = evidence.table.noise_scale, item.score.statistic
     remaining = evidence.chi2 - statistic * (noise * evidence.scale) ** 2
     suffices = explains(remaining, evidence.dof - item.score.rank)
     linear = item.log_bayes + evidence.by_fit(item.score)
-    return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, linear=linear)
+    return Trial(item.effect, item.log_bayes, remaining, suffices, item=item, expected=linear)
 
 
 # ------------------------------------------------------------------------------------------------------- one round
@@ -151,10 +152,10 @@ Probable = tuple[float, Trial]
 
 
 @dataclasses.dataclass
-class _Turn:
+class _RoundInProgress:
     """One round as it goes on: its trials by name, with what speaks against each, and what it has cost.
 
-    `fits` and `choices` begin as those of the state.
+    `fits` and `choices` start from those of the state.
     """
 
     state: State
@@ -166,7 +167,7 @@ class _Turn:
     others_asked: bool = False
 
     @classmethod
-    def of(cls, state: State, judge: Judge) -> _Turn:
+    def of(cls, state: State, judge: Judge) -> _RoundInProgress:
         """The round of a state, in which nothing has been tried."""
         return cls(state, judge, most_probable(state.evidence), state.fits, state.choices)
 
@@ -176,16 +177,16 @@ class _Turn:
         return self.state.evidence
 
     def passes(self, trial: Trial) -> bool:
-        """Whether nothing speaks against a trial; it is noted in any case."""
+        """True if nothing speaks against a trial. The trial is recorded in `trials` in any case."""
         self.trials[trial.name] = dataclasses.replace(trial, refused=against(trial))
         return not self.trials[trial.name].refused
 
     def names_of(self, thing: Thing) -> list[Probable]:
         """The names of a thing that nothing speaks against, as they were fitted.
 
-        Names outside of the set of the thing are fitted only where the fits of those in it have found them less
-        probable than their linear steps said. Of a thing that a pattern describes best the first name is fitted all the
-        same: linear steps are off by parts of a per cent, which a pattern follows and a name does not.
+        Names outside the set of the thing are fitted only if a name of the set passed and its fit made it less
+        probable than the next name is by its linear step. If a pattern describes the thing best, the first name alone
+        is fitted: linear steps are off by parts of a per cent, which a pattern can follow and a name cannot.
         """
         passed = list[Probable]()
         for number, (name, probability) in enumerate(thing.probabilities.items()):
@@ -195,23 +196,25 @@ class _Turn:
             if item is None or item.name in self.trials:
                 continue
             expected = float(np.log(max(probability, 1e-300)))
-            settled = any(trial.noise or worth >= expected for worth, trial in passed)
+            settled = any(trial.leaves_noise or worth >= expected for worth, trial in passed)
             if settled or self.judge.over(self.fits):
                 break
             self.fits += 1
             trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
-            worth = expected + (trial.evidence - trial.linear) / self.evidence.floor**2
+            worth = expected + (trial.evidence - trial.expected) / self.evidence.floor**2
             if self.passes(trial) and not self._is_pattern(thing, trial, worth):
                 passed.append((worth, trial))
         return passed
 
     def _is_pattern(self, thing: Thing, trial: Trial, worth: float) -> bool:
-        """Whether a thing is more probably a pattern without a name than what a trial says; it is noted then.
+        """True if a thing is more probably a pattern without a name than what a trial says; the trial is then refused.
 
-        Where a trial leaves nothing but noise of what was clearly missing, a pattern can only describe the same with
-        more numbers.
+        False if something was clearly missing and the trial leaves nothing but noise: a pattern could only describe
+        the same with more numbers.
         """
-        if worth > thing.patterns or (trial.noise and not explains(self.evidence.chi2, self.evidence.dof)):
+        if worth > thing.patterns or (
+            trial.leaves_noise and not explains(self.evidence.chi2, self.evidence.dof)
+        ):
             return False
         refused = f"a pattern without a name is more probable, by {thing.patterns - worth:.3g} in ln B"
         self.trials[trial.name] = dataclasses.replace(trial, refused=refused)
@@ -220,10 +223,13 @@ class _Turn:
     def explains(self, trial: Trial) -> bool:
         """Whether a trial explains so much that what has no linear step need not be asked."""
         missing = self.evidence.chi2 - self.evidence.dof
-        return trial.noise or self.evidence.chi2 - trial.left > thresholds.GOOD_SHARE * missing
+        return trial.leaves_noise or self.evidence.chi2 - trial.remaining > thresholds.GOOD_SHARE * missing
 
     def others(self, names: Sequence[Probable]) -> list[Probable]:
-        """What has no linear step, once in a round; compared with names by the evidence of the fits of both."""
+        """Trials of what has no linear step, once in a round; [] when asked again.
+
+        They are compared with `names` by the evidence of their fits.
+        """
         if self.others_asked:
             return []
         self.others_asked = True
@@ -263,7 +269,7 @@ class _Turn:
         things, least = self.posterior.things, 1.0 - thresholds.CERTAIN
         if not things:
             return f"nothing more is missing with a probability of {self.posterior.nothing_more:.2g}"
-        # A name that nothing is likely to be is held against what is missing most clearly.
+        # A name that is improbable for every thing is compared with the thing that is missing most clearly.
         thing = next((t for t in things if t.probabilities.get(name, 0.0) > least), things[0])
         if thing.is_pattern:
             return f"a pattern without a name is more probable ({thing.candidate})"
@@ -275,7 +281,7 @@ class _Turn:
 
 def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
     """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
-    turn, accepted = _Turn.of(state, judge), None
+    turn, accepted = _RoundInProgress.of(state, judge), None
     things = list(turn.posterior.things)
     while accepted is None and not judge.over(turn.fits):
         thing = things.pop(0) if things else None
@@ -287,7 +293,7 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
             accepted = _with_rivals(state.evidence, accepted, thing, passed)
         elif thing is None:
             break
-        elif thing.is_pattern:  # what is weaker would be fitted without it, and imitate it
+        elif thing.is_pattern:  # a weaker one, fitted without it, would imitate it
             things = []
     added = "" if accepted is None else accepted.name
     rounds = (*state.rounds, Round(state.evidence.table.p_global, added, tuple(turn.reasons(added))))
@@ -309,9 +315,9 @@ def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
 
 
 def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: Iterable[Probable]) -> Trial:
-    """A trial with the other names that it may have: those of the set of its thing, and those that fits find as likely.
+    """A trial with its rivals, and its probability among them.
 
-    And with its probability among all of these.
+    Rivals are the other names in the set of its thing, and the names that passed with about the same probability.
     """
     worth = {other.name: probable for probable, other in passed}
     near = [name for name, value in worth.items() if value > worth[trial.name] - thresholds.IMPROBABLE]

@@ -7,15 +7,15 @@ not linear" are two things; for the first of them "ghost" and four descriptions 
 Prior        One thing more is missing with probability 1 − ν. It is of one of K kinds, equally probable: each effect
              is a kind, all descriptions together are one, all parts, all patterns; the candidates of a kind share its
              probability π. Amplitudes are N(0, t²w²) with prior widths w and scales t (`score.SCALES`), all equally
-             probable; t = 1 for a single amplitude. Of an amplitude that physics keeps above 0 the prior is the half of
-             that normal distribution, twice as dense.
-Evidence     Of a set M of candidates with columns A behind the free parameters, G = AᵀA and s = Aᵀr in units of the
-             scatter behind all candidates, T = t²w²:
+             probable; t = 1 for a single amplitude. An amplitude that physics keeps above 0 has the positive half of
+             that normal distribution as its prior, with twice the density.
+Evidence     For a set M of candidates, with A their columns once the free parameters are projected out, G = AᵀA and
+             s = Aᵀr in units of the scatter that all candidates leave, T = t²w²:
 
                  ln B(M) = ½ sᵀT^½ (1 + T^½GT^½)⁻¹ T^½s − ½ ln det(1 + T^½GT^½)
 
-             Every other candidate is scored beside M by the same formula, with G and s less what M takes up. The
-             posterior of M is proportional to B(M) Π π (1 − ν)/ν.
+             Every other candidate is scored in the model with M by the same formula, once the parts of G and s that
+             M explains are subtracted. The posterior of M is proportional to B(M) Π π (1 − ν)/ν.
 Search       The most probable candidate is added until nothing more is missing with a probability above 1 − λ. After
              each addition every member is taken out in turn, and the most probable candidate beside the others takes
              its place, until nothing changes; a member that is less probable than its absence goes.
@@ -47,9 +47,7 @@ from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import SCALES, Vector, log_bayes_by_scale
 from walop_jax.model.effects import Described
 
-MOST_EXCHANGES = (
-    10  # rounds of exchanges after one addition: they end by themselves, but for candidates that are equal
-)
+MOST_EXCHANGES = 10  # rounds after one addition; only candidates that are equal would change places for ever
 
 Member = tuple[int, float]
 """A candidate by its position, and the scale t of the prior of its amplitudes."""
@@ -62,10 +60,9 @@ class Thing:
     `candidate` is the probe, or the name of the pattern, with the largest posterior probability; `log_evidence` is its
     ln B beside the other things, in units of the scatter behind all candidates. `probabilities` are those of all names
     of effects and of all descriptions, the most probable first; `equal` the same, were all of them equally probable
-    beforehand. `shapes` are the probes that each name of the set may mean, down to the `thresholds.CERTAIN` part of its
-    probability. `patterns` is ln of the ratio of the probability that it is a pattern without a name to the one that it
-    is any of the names; of the thing with the most evidence beside the other things or alone, whichever is less: the
-    others may be there only because linear steps are off by parts of a per cent of it.
+    beforehand. `shapes` are the shapes (probes) that each name of the set may have: the shortest list that holds
+    `thresholds.CERTAIN` of its probability. `patterns` is ln [P(the thing is a pattern without a name) / P(it has one
+    of the names)].
     """
 
     candidate: Probe | str
@@ -88,9 +85,9 @@ class Thing:
 
 @dataclasses.dataclass(frozen=True)
 class Posterior:
-    """The most probable set of things for one fit, that with the most evidence first.
+    """The most probable set of things that are missing in one fit, the one with the most evidence first.
 
-    And the probability that nothing more is missing beside them.
+    `nothing_more` is the probability that nothing is missing beside them.
     """
 
     things: tuple[Thing, ...]
@@ -98,9 +95,9 @@ class Posterior:
 
     @property
     def explains(self) -> bool:
-        """True if names say what is there: nothing more is missing, no pattern is needed, and few things are nameless.
+        """True if names explain the fit: nothing more is missing, no pattern is needed, few things are nameless.
 
-        More than `thresholds.MOST_SENTENCES` descriptions can be one thing that none of them holds.
+        Few are `thresholds.MOST_SENTENCES`: more descriptions than that may imitate one cause that no description is.
         """
         nameless = [t for t in self.things if isinstance(t.candidate, Probe) and _is_nameless(t.candidate)]
         patterns = any(thing.is_pattern for thing in self.things)
@@ -158,7 +155,7 @@ class JointScores:
     # --------------------------------------------------------------------------------------------- evidence
 
     def beside(self, members: Sequence[Member]) -> Float[np.ndarray, "n t"]:
-        """ln B of every candidate at each scale beside some members; −∞ where it is not asked."""
+        """ln B of every candidate at each scale of its prior, in a model with `members`; −∞ where it has none."""
         along, taken = self._taken_up(members)
         scores = self.scores - along @ taken
         found = np.full((len(self.names), len(SCALES)), -np.inf)
@@ -178,7 +175,7 @@ class JointScores:
         return found
 
     def _taken_up(self, members: Sequence[Member]) -> tuple[Float[np.ndarray, "a m"], Vector]:
-        """What members take up of all columns, and of the scores."""
+        """The part of all columns, and of the scores, that `members` explain."""
         if not members:
             return np.zeros((len(self.widths), 0)), np.zeros(0)
         places = [self._places[number] for number, _ in members]
@@ -197,25 +194,38 @@ class JointScores:
     # ------------------------------------------------------------------------------------------- the search
 
     def posterior(self) -> Posterior:
-        """The most probable set of things, one added after the other, with exchanges."""
-        members, odds = (
-            list[Member](),
-            float(np.log(1.0 - thresholds.NOTHING_MORE) - np.log(thresholds.NOTHING_MORE)),
-        )
-        while True:
-            best, total = self._best(members)
-            nothing_more = float(special.expit(-(total + odds)))
-            if nothing_more > 1.0 - thresholds.CERTAIN or len(members) == thresholds.MOST_STEPS:
-                break
-            members = self._exchanged([*members, best], odds)
+        """The most probable set of things.
+
+        Where it has a pattern without a name, a second search begins with names alone, and the more probable set of
+        both counts: a pattern takes in two things at once that no single name does, and no exchange of one member for
+        another leads from there to two names.
+        """
+        members = self._grown([])
+        if not all(self.is_named[number] for number, _ in members):
+            members = max(members, self._grown(self._grown([], self.is_named)), key=self._total)
+        nothing_more = float(special.expit(-(self._best(members)[1] + _odds())))
         things = sorted(self._things(members), key=lambda thing: -thing.log_evidence)
-        if things:
-            alone = self._odds_of_patterns(self._probable([])[0])
-            things[0] = dataclasses.replace(things[0], patterns=min(things[0].patterns, alone))
         return Posterior(tuple(things), nothing_more)
 
+    def _grown(self, members: list[Member], allowed: Bool[np.ndarray, " n"] | None = None) -> list[Member]:
+        """A set to which things are added, with exchanges, until nothing more is missing; of candidates `allowed`."""
+        while len(members) < thresholds.MOST_STEPS:
+            best, total = self._best(members, allowed)
+            if special.expit(-(total + _odds())) > 1.0 - thresholds.CERTAIN:
+                break
+            members = self._exchanged([*members, best], allowed)
+        return members
+
+    def _total(self, members: Sequence[Member]) -> float:
+        """ln of the posterior of a set, but for a constant of all sets."""
+        total = 0.0
+        for count, (number, scale) in enumerate(members):
+            bayes = self.beside(members[:count])[number, int(np.argmax(scale == SCALES))]
+            total += float(bayes + self.log_prior[number] - np.log(self.scales_of[number])) + _odds()
+        return total
+
     def _odds_of_patterns(self, worth: Vector) -> float:
-        """ln of the ratio of the probability of all patterns to that of all names, from ln of B π of candidates."""
+        """ln [P(any pattern) / P(any name)]; `worth` is ln B π of every candidate."""
         return _log_sum(worth[~self.is_named]) - _log_sum(worth[self.is_named])
 
     def _probable(self, members: Sequence[Member]) -> tuple[Vector, Float[np.ndarray, "n t"]]:
@@ -225,21 +235,29 @@ class JointScores:
         worth[[number for number, _ in members]] = -np.inf
         return worth, found
 
-    def _best(self, members: Sequence[Member]) -> tuple[Member, float]:
-        """The most probable candidate beside some members, and ln of the sum of B π over all."""
+    def _best(
+        self, members: Sequence[Member], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> tuple[Member, float]:
+        """The most probable candidate for a model that has `members`, and ln Σ B π, over those `allowed` (all)."""
         worth, found = self._probable(members)
+        if allowed is not None:
+            worth = np.where(allowed, worth, -np.inf)
         number = int(np.argmax(worth))
         return (number, float(SCALES[np.argmax(found[number])])), float(np.logaddexp.reduce(worth))
 
-    def _exchanged(self, members: list[Member], odds: float) -> list[Member]:
+    def _exchanged(
+        self, members: list[Member], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> list[Member]:
         """The members, each replaced by the most probable candidate beside the others, until nothing changes."""
         for _ in range(MOST_EXCHANGES):
             before = list(members)
             for member in before:
                 others = [one for one in members if one != member]
                 worth, found = self._probable(others)
+                if allowed is not None:
+                    worth = np.where(allowed, worth, -np.inf)
                 number = int(np.argmax(worth))
-                if worth[number] + odds < 0.0:
+                if worth[number] + _odds() < 0.0:
                     members = others
                 else:
                     scale = float(SCALES[np.argmax(found[number])])
@@ -262,7 +280,7 @@ class JointScores:
     def _named(
         self, bayes: Vector
     ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[Probe, ...]]]:
-        """Probabilities of all names, by their prior and equally probable beforehand; shapes of those of the set."""
+        """Probabilities of all names by their own and by equal priors, and the shapes of names of the set."""
         worth = bayes + self.log_prior
         of_name = collections.defaultdict[str, list[int]](list)
         for number, name in enumerate(self.names):
@@ -280,6 +298,11 @@ class JointScores:
         return by_prior, equal, shapes
 
 
+def _odds() -> float:
+    """ln of the odds beforehand that one thing more is missing."""
+    return float(np.log(1.0 - thresholds.NOTHING_MORE) - np.log(thresholds.NOTHING_MORE))
+
+
 def _on_its_side(
     one_sided: Bool[np.ndarray, "n k"],
     vector: Float[np.ndarray, "n k k"],
@@ -288,7 +311,7 @@ def _on_its_side(
 ) -> Float[np.ndarray, "n t"]:
     """ln of the probability that one-sided amplitudes are above 0, by data and prior against the prior alone.
 
-    Exact for one amplitude; of several each is taken by itself. `spread` are the variances of the amplitudes along the
+    Exact for one amplitude; several are independent here. `spread` are the variances of the amplitudes along the
     columns of `vector`, `turned` the scores there.
     """
     mean = -np.einsum("nij,ntj,nj->nti", vector, spread, turned)

@@ -4,13 +4,13 @@
 name; global p by Monte Carlo. 3. Below `thresholds.ALARM`: add names one after the other (`search`), each fitted
 together with everything before it is added (`refits`). 4. Drop names that are not needed beside the others. 5. Names
 that leave a poor fit nearly as poor are reported as parts of the missing effect, and taken out again. 6. What no name
-explains is described, and the verdict is `unexplained`; a free-form term for it stays in the model where it predicts
-settings and parts of the field that it has not seen, and names that only stood in for it are dropped (`remainder`). 7.
-List for each name what the data cannot separate from it, and give the verdict. Names are given at any size;
-`Step.negligible` says when it does not matter for q and u.
+explains is described, and the verdict is `unexplained`. A free-form term for it stays in the model if it predicts
+held-out settings and parts of the field; names that only imitated it are dropped (`remainder`). 7. List for each name
+what the data cannot separate from it, and give the verdict. An effect is named however small it is; `Step.negligible`
+is True if it does not matter for q and u.
 
-Work is bounded by counts of fits, so that one set has one answer however busy the machine is; whoever asks for
-`minutes` gets the best found so far when they are over, and a note that says so.
+Work is limited by the number of fits, so that the answer does not depend on how busy the machine is. With `minutes` the
+search ends when they are over, with the best that was found so far and a note that says so.
 """
 
 from __future__ import annotations
@@ -70,11 +70,11 @@ def diagnose(
 
     `catalogue` are the effects that may be named (default: those of the model). Of a set with more than
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
-    points spread over the field are looked at; cells of whole frames are joined to so many. Nothing further is tried
-    after `thresholds.MOST_FITS` fits of additions (fewer where the model is far from the data), nor after `minutes`, if
-    given; what is left then has no name, and `Diagnosis.caution` says so. Both fits are examined. Other readings of the
-    data are not tried where the caller has done that already (`as_written`). Raises what `fit` raises, and `DataError`
-    for data that another reading explains (`readings`).
+    only a sample is used: points spread over the field, or cells of whole frames joined to larger ones. Nothing further
+    is tried after `thresholds.MOST_FITS` fits of additions (fewer where the model is far from the data), nor after
+    `minutes`, if given; what is left then has no name, and `Diagnosis.caution` says so. The fits before and after the
+    additions are both examined. With `as_written` no other reading of the data is tried: the caller has done that.
+    Raises what `fit` raises, and `DataError` for data that another reading explains (`readings`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -93,7 +93,7 @@ def diagnose(
     tell(Stage("fitting the model", "fitting"))
     context = effect_context(model.template, sample.exposures)
     structural = [effect.neutral(context) for effect in candidates.effects if effect.is_structural()]
-    # Amplitudes mean nothing where the model is far off: what has none is asked first, and ends the comparison.
+    # Amplitudes mean nothing where the model is far off: causes without an amplitude are tried first.
     left, causes = (np.nan, ()) if as_written else causes_before_a_fit(sample, model, structural, tell)
     if causes and causes[0].of_data and causes[0].explained < thresholds.READING_SURE:
         raise refusal(left, causes)
@@ -126,7 +126,7 @@ def diagnose(
     else:
         state = first
     explained = state.evidence.result
-    # Another reading that comes near competes with names and with other descriptions of the instrument.
+    # Names left a remainder: a cause that leaves less (another reading, say) is then the answer.
     if remainder and causes and not number and causes[0].explained * explained.dof < explained.chi2:
         raise refusal(left, causes)
     if not conditions.items and (state.steps or remainder):
@@ -174,7 +174,7 @@ def diagnose(
 def _members(first: State, state: State, steps: Sequence[Step]) -> Classes:
     """Candidates that the data cannot distinguish from the additions, and their effect on stars."""
     alike = dict[str, Collection[str]]()
-    # Of a single group also what the final model cannot separate from it; of several that is of all together.
+    # A single group has the rivals of the final model as well; of several groups these are rivals of all together.
     for trial, step in zip(state.steps, steps, strict=True):
         names = tuple(trial.groups) or (step.effect,)
         alone = {*step.equivalent, *step.nameless} - {Described.name}
@@ -200,7 +200,7 @@ def _examined(
     for sentence in rivals:
         after = after.with_remark(sentence)
     before = diagnosis.before
-    # Where χ² contradicts the model given, the steps name the missing effects.
+    # If χ² contradicts the given model, its residuals are not examined: the steps name the missing effects.
     explained = before.explains_data or before.nearly_explains_data
     before = (
         examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.with_verdict()

@@ -1,8 +1,8 @@
 """Numbers of a catalogue that cannot be what they say: units of counts, errors of cameras, frames of the positions.
 
-Doubts are about every star of it: nothing that is made of them is to be trusted. Remarks name the likeliest cause.
-Neither asks the calibration. Dates, temperatures and detectors are looked at as those of calibration sets are
-(`data.plausible`).
+A doubt concerns every star of the catalogue: no result that uses these numbers is to be trusted. A remark names the
+likeliest cause. Neither needs the calibration. Dates, temperatures and detectors are checked in the same way as those
+of calibration sets (`data.plausible`).
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from walop_jax.sky.directions import Pointing
 OfRows = Float[np.ndarray, " n"]
 Counts = Float[np.ndarray, "n k"]
 
-BRIGHT = 1000.0  # electrons: their errors are a few per cent, with a read noise of 100 electrons a tenth
+BRIGHT = 1000.0  # electrons: errors of larger counts are a few per cent, a tenth with a read noise of 100 electrons
 QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
 _RELATIVE = 0.3  # error of bright stars above which N_ERR is no share of N
 _NOISIER = 10.0  # of the variance of photons: sky and detectors add to it
-_SHARE = 0.1  # of the stars, or rows, from which an oddity is about the catalogue
-_TURNED = 1.0  # deg, by which ROTATOR may differ from what positions say: convergence of meridians
-_SCALE = 0.02  # by which the scale of X and Y may
+_SHARE = 0.1  # share of the stars, or rows, above which an oddity concerns the whole catalogue
+_TURNED = 1.0  # deg by which ROTATOR may differ from the angle that the positions give: meridians converge
+_SCALE = 0.02  # relative difference that may be between the scale of X, Y and that of RA, DEC
 _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
 """Rows that are looked at, and needed; share of their extent by which positions of several fields scatter."""
 
 
 def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
-    """Sentences where errors are none of electrons, so that neither they nor the counts are what they should be."""
+    """Sentences if N_ERR cannot be the errors of counts N in electrons: one of the two is in another unit."""
     lit = np.isfinite(counts) & (counts > 0)
     bright = lit & (sigma > 0) & (np.maximum(counts, sigma) > BRIGHT)
     if bright.any():
@@ -125,7 +125,7 @@ def _apart(one: float, other: float) -> float:
 
 
 def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> Iterator[str]:
-    """Remarks on errors of a camera (electrons) that are larger than its counts in all rows, or a placeholder."""
+    """Remarks on errors of a camera (electrons) that exceed its counts in all rows, or are the same in all rows."""
     used = np.isfinite(counts) & np.isfinite(sigma)
     for k, name in enumerate(names):
         n, error, on = counts[:, k], sigma[:, k], used[:, k]
@@ -136,12 +136,12 @@ def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> It
 
 
 def not_measured(counts: Counts, sigma: Counts) -> Bool[np.ndarray, "n k"]:
-    """Where N and N_ERR are one negative number, as catalogues have it in the place of what was not measured."""
+    """True where N and N_ERR are the same negative number, which catalogues write for a value that is missing."""
     return (counts < 0) & (counts == sigma)
 
 
 def stars_of_one_name(star: Int[np.ndarray, " n"], x: OfRows, y: OfRows, time: OfRows) -> Iterator[str]:
-    """A sentence where rows of one star lie at several places of the field at one time."""
+    """A sentence if many stars have rows at several places of the field at the same time."""
     dated = np.flatnonzero(np.isfinite(time + x + y))
     exposure = np.unique(time[dated], return_inverse=True)[1].reshape(-1)
     _, of = np.unique(np.stack([star[dated], exposure], axis=1), axis=0, return_inverse=True)
@@ -161,7 +161,7 @@ def stars_of_one_name(star: Int[np.ndarray, " n"], x: OfRows, y: OfRows, time: O
 def ceilings(
     counts: Counts, used: Bool[np.ndarray, " n"], names: Sequence[str]
 ) -> Iterator[plausible.Implausible]:
-    """Counts that are the largest of their camera in several rows: those of all cameras at once are one sentence."""
+    """Faults of counts that are the largest in several rows: one if all cameras share it, else one for each."""
     top = np.nanmax(np.where(used[:, None], counts, -np.inf), initial=-np.inf)
     full = (counts == top) & used[:, None]
     if full.any(axis=0).sum() > 1 and full.any(axis=1).sum() >= _FEWEST:
@@ -175,6 +175,6 @@ def ceilings(
 
 
 def many_are_full(counts: Counts) -> bool:
-    """True where the largest number of all cameras is there in too many rows to be left to single stars."""
+    """True if the largest count of all cameras stands in more rows than single saturated stars explain."""
     full = counts == np.nanmax(counts, initial=-np.inf)
     return bool(np.mean(full.any(axis=1)) > _SHARE and full.sum() >= _FEWEST)

@@ -12,14 +12,14 @@ once        h = 1 in a single group
 
     z = hᵀg / √(hᵀQh),   β = hᵀg / hᵀQh,   σ_β = (hᵀQh)^(−1/2), the Cramér–Rao bound (matched filter)
 
-All cameras together are flux: no history of theirs leaves a trace. Asked are the gains of cameras and of arms (all
+A gain that all cameras have in common is flux, and leaves no trace. Tested are the gains of cameras and of arms (all
 cameras of one), their gradients over the field (of any direction φ: β cos φ x + β sin φ y, as χ² of two numbers), spots
-(`places`) and the numbers of the optics (thicknesses, axes of plates, …). One correction for all of it: noise
-raises an alarm in one of 1/`ALARM` catalogues, at z₀; the size seen in 99 % is (z₀ + 2.33) σ_β. A detected change
-competes with all others of the same history: those that describe the stars as well are reported together, and a camera
-is named only if no other is among them. A number of the optics that would have to change by more than `FARTHEST` widths
-of its prior explains nothing: its columns are first-order, and no optics moves that far. If only such a number
-describes the stars, they have changed by something that has no name here.
+(`places`) and the numbers of the optics (thicknesses, axes of plates, …). All tests share one correction: noise raises
+an alarm in one of 1/`ALARM` watches. With z₀ the threshold, a change of size (z₀ + 2.33) σ_β is detected in 99 % of
+cases. A detected change competes with all others of about the same history: those that describe the stars as well are
+reported together, and a camera is named only if no other is among them. A number of the optics that would have to
+change by more than `FARTHEST` widths of its prior explains nothing: its columns are first-order, and no optics moves
+that far. If only such a number describes the stars, a change without a name is reported.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Watching(StarSearch):
     def __init__(self, stars: StarResiduals, vectors: AnalysisVectors) -> None:
         super().__init__(stars, vectors, OF_SURVEYS)
         columns, every = self.columns, range(len(self.cameras))
-        # The last arm is no other than all before it: the sum of all is flux.
+        # Without the last arm: all arms together are flux, so that its gain is that of the others, reversed.
         units = [*((k,) for k in every), *columns.arms[: len(vectors.instrument.cameras.arms) - 1]]
         self.of_cameras = [columns.of_one("gain", unit) for unit in units]
         self.members = np.array([[float(k in unit) for unit in units] for k in every])
@@ -112,9 +112,9 @@ class Watching(StarSearch):
         self.shapes = np.stack([h.over(self.time) for h in self.histories], axis=1)
         self.spoilt = np.zeros(len(stars.photon), bool)  # by spots that were found
         self.tests = len(self.histories) * sum(question.number for question in self.questions)
-        # Half of the false alarms are for spots: as many as there are would else take from all others.
+        # Half of the false alarms are left to spots, which are so many that they would raise the threshold of the rest.
         self.alarm = threshold(0.5 * ALARM / self.tests)
-        # Stars of a single group have a scale with the others of it; those of several groups together.
+        # Stars that share a noise scale: those of one exposure group; and all stars that are in several groups.
         low, high = (op.reduceat(self.group, stars.first) for op in (np.minimum, np.maximum))
         self.pool = np.where(low == high, low, groups)
 
@@ -138,14 +138,17 @@ class Watching(StarSearch):
         return weights, scale
 
     def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[Weights, Scale, bool]:
-        """Weights behind numbers fitted in every group, the scale; True if any scale is not that of N_ERR."""
+        """Weights, the scale of all stars, and whether any scale differs from that of N_ERR.
+
+        `fitted` is how many numbers were fitted in each group before.
+        """
         chi2 = self.stars.chi2(residual) / self.variance
         dof, alarm = self.stars.dof.astype(float), ALARM / (len(self.time) + 1)
         least = 1.0 if np.median(self.variance) > residuals.CROWDED else 0.0
         overall = residuals.beside_fitted(residuals.noise_scale(chi2, dof), dof, float(fitted.sum()))
         off = residuals.is_off(overall, alarm)
         common = max(overall.value, least) if off else 1.0
-        if fitted.any():  # N_ERR was in doubt ahead of the gains
+        if fitted.any():  # gains are fitted only if N_ERR is in doubt
             common = max(overall.value, 1.0) * (residuals.of_few(overall, self.alarm) if off else 1.0)
         weight, share, several = np.where(overall.kept, 1.0 / common, 0.0), overall.share.copy(), off
         for pool in np.unique(self.pool):
@@ -163,7 +166,7 @@ class Watching(StarSearch):
         return Weights(weight / self.variance, share), overall, several
 
     def _behind_gains(self, residual: Residuals, weights: Weights, count: int) -> tuple[Residuals, OfGroups]:
-        """Residuals behind the first `count` columns as they fit each group best, and how many numbers these are."""
+        """Residuals less the best fit of the first `count` columns in each group; the numbers fitted in each."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
         size, fitted = np.zeros((groups, count)), np.zeros(groups)
@@ -254,7 +257,7 @@ class Watching(StarSearch):
         return matrix.reshape(*slopes.shape, *slopes.shape), slopes
 
     def suspects(self, found: Answers) -> list[PossibleChange]:
-        """Readings with the best history of each kind and its neighbours, the strongest first, too large ones last."""
+        """Changes with the best history of each kind or a neighbour of it: strongest first, impossible ones last."""
         strength = np.max(np.abs(found.size / found.error), axis=1)
         compared: list[int] = []
         for kind in ("step", "drift", "once"):
@@ -270,7 +273,7 @@ class Watching(StarSearch):
         return sorted(listed, key=lambda entry: (not entry.possible, -abs(entry.sigma)))
 
     def without(self, residual: Residuals, change: PossibleChange, size: float) -> Residuals:
-        """Residuals behind a change."""
+        """The residuals less a change of this size."""
         return self.stars.behind(residual, lambda part, rows: self.column(part, rows, change) * size)
 
     def column(self, part: StarResiduals, rows: slice, change: PossibleChange) -> Residuals:
@@ -340,7 +343,10 @@ class Watching(StarSearch):
         return self.stars.behind(residual, lambda *part: self.errors(part[0]) @ errors)
 
     def _likeliest(self, ways: list[Settled]) -> Settled | None:
-        """The change behind which χ² is least, stars that are left out at their cut; others as good are alike."""
+        """The change that leaves the least χ², outliers counted with the χ² at which they are cut.
+
+        Another one that leaves about as little is joined to it as alike.
+        """
         if len(ways) < 2:
             return ways[0] if ways else None
         dof = self.stars.dof.astype(float)
@@ -349,14 +355,14 @@ class Watching(StarSearch):
         cut = special.chdtri(np.maximum(dof, 1e-12), residuals.TRIMMED)
         cost = [float(np.minimum(chi2 / scale, cut)[dof > 0].sum()) for chi2 in costs]
         near = abs(cost[1] - cost[0]) < RIVAL and ways[1][0].best.kind != UNNAMED
-        # The simpler one, if both are as good: spots are the first.
+        # If both are as good the simpler one is the answer: it stands behind the spot, which is the first of `ways`.
         (change, remaining), (alternative, _) = ways[::-1] if near else (ways[n] for n in np.argsort(cost))
         if near:
             change = dataclasses.replace(change, alike=change.alike + alternative.alike)
         return change, remaining
 
     def answers(self, matrix: Matrix, score: Score) -> Answers:
-        """Every history of every question, each alone."""
+        """Size and error of every question with every history, each tested by itself."""
         (blocks, slopes), shapes = self._by_group(matrix, score), self.shapes
         size = shapes.shape[1], len(self.questions)
         answers = Answers(np.zeros(size), np.full(size, np.inf), np.zeros(size))
@@ -390,8 +396,8 @@ class Watching(StarSearch):
     def settled(self, residual: Residuals, answers: Answers) -> Settled:
         """A change with its rivals, and the residuals behind it.
 
-        Histories compared are the best of each kind and camera and their neighbours. The fit is repeated with the
-        stars that it keeps.
+        Compared are the best history of each kind (step, drift, once) and its neighbours, for every question. The fit
+        is repeated, each time with the stars that it has kept.
         """
         best: PossibleChange | None = None
         total, remaining, alike = 0.0, residual, []
@@ -424,7 +430,7 @@ class Watching(StarSearch):
 
     def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
-        # Stars that lie off may be those of the spot.
+        # Stars that were left out as outliers may be those of the spot: here they have the weight of all others.
         common = np.zeros(len(self.time) + 1)
         np.maximum.at(common, self.pool, weights.inverse * self.variance)
         inverse = common[self.pool] / self.variance
@@ -432,7 +438,7 @@ class Watching(StarSearch):
         if usable.sum() < residuals.FEW:
             return None
         variance = 1.0 / np.where(usable, inverse, 1.0)
-        found: list[tuple[Strongest, int, Seen]] = []  # that of all rows, and the strongest
+        found: list[tuple[Strongest, int, Seen]] = []  # the spot in all rows, then the strongest one
         trials = 0
         later = places.seen_from(self.stars, self.group, self.members, residual, variance)
         for start, seen in enumerate(every.of(usable) for every in later):
@@ -484,7 +490,7 @@ class Watching(StarSearch):
         )
 
     def told(self, changes: list[FoundChange], matrix: Matrix, score: Score, noise: float) -> Watch:
-        """The record: gains are those behind the changes, and the changes that each camera may be."""
+        """The record of the watch; the gain of a camera is what the changes leave, plus the change that it may have."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)
         gain, error, smallest = (np.full((groups, cameras), np.nan) for _ in range(3))

@@ -1,20 +1,20 @@
 """Do the stars of a catalogue, all together, still agree with the calibration and with their stated errors?
 
-Asked are, of the residuals of `star_residuals`:
+The residuals of `star_residuals` are tested for:
 
 noise       Σ χ² against Σ ν, from both sides: N_ERR too small or too large
 rows        the common part of the rows of one star: rows that are there twice, noise that is correlated
-changes     every column of `star_columns` that was there always: cameras one by one, light added to all of them, all
-            parameters of the optics; the strongest is fitted with the errors of the calibration and asked for again,
-            until nothing is left
+changes     every change of `star_columns` that acts in all rows: of cameras one by one, light added to all of them, all
+            parameters of the optics. The strongest one is fitted with the errors of the calibration, and the others
+            are tested again beside it, until none raises an alarm
 places      stars that disagree together at one place of the field: dust on a camera, a ghost, a blemish
 
-One correction for all of them: the chance is `ALARM` that noise raises any. Where analysers split the light in two,
-stars of a single exposure can hardly tell the cameras of an arm, or one arm brighter from the other fainter: what
-describes the data as well (Δχ² < `RIVAL`) is reported together.
+All tests share one correction: noise raises any alarm at all with the probability `ALARM`. Where analysers split the
+light in two, stars of a single exposure can hardly tell the two cameras of an arm apart, or one arm that is brighter
+from the other that is fainter: changes that describe the data as well (Δχ² < `RIVAL`) are reported together.
 
-The score test of a column c, alone beside others that are fitted (errors of the calibration with their prior among
-them), is that of Rao 1948 (Proc. Camb. Phil. Soc. 44, 50), from Q and g of `star_residuals`:
+A column c is tested by itself, in a model that fits others (among them the errors of the calibration, with their
+prior), by the score test of Rao 1948 (Proc. Camb. Phil. Soc. 44, 50), from Q and g of `star_residuals`:
 
     z = g/√Q,   size g/Q,   error Q^(−1/2), the Cramér–Rao bound
 
@@ -22,8 +22,9 @@ Places      A camera that is brighter by the share β g, g = exp(−d²/2s²) at
 
                 r = β g P c + noise,    c the counts of the model in that camera
 
-            Of every star and camera  z = cᵀr / √(v₀ cᵀPc)  is normal with unit variance, v₀ that of its residuals, and
-            α = √(cᵀPc / v₀) says how well it sees the camera. At every star as a centre, for every size s and camera
+            For every star and camera  z = cᵀr / √(v₀ cᵀPc)  is normal with unit variance, v₀ the variance of the
+            residuals of the star, and α = √(cᵀPc / v₀) says how well the star sees the camera. With every star as a
+            centre, for every size s and camera
 
                 Z = Σ w ψ(z) / √(v Σ w²),    w = α g or w = g
 
@@ -31,7 +32,7 @@ Places      A camera that is brighter by the share β g, g = exp(−d²/2s²) at
             four are needed, and stars that are off alone, however far, make no place. Z is normal, or has shorter
             tails; Bonferroni's bound over centres, sizes, cameras and weights keeps false alarms below `ALARM` a
             catalogue. A matched filter with a bounded score: Huber 1981, Robust Statistics, chapter 4. The watch of
-            many nights looks for spots by the same, with the stars of each group and of all that follow it.
+            many nights (`watch`) looks for spots in this way, in the rows of each exposure group and all later ones.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ _MOST_CHANGES = 6
 _ROUNDS = 8
 _SETTLED = 0.05  # standard errors
 _FARTHEST = 5.0  # standard errors in every direction: no calibration is so far off by chance
-_INFORMED = 1e-9  # share of its square that a column must have once all others are fitted
+_INFORMED = 1e-9  # least share of its square that a column must keep once all others are fitted
 CUT = 3.0
 SIZES = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Sizes s that are looked for, as shares of the largest |X|, |Y| of the stars: 0.009 to 0.07° of a WALOP."""
@@ -78,7 +79,7 @@ _CELLS = 3  # in a size, along a side
 _TOGETHER = 1 / 64  # of the largest |X|, |Y|: rows of a star that lie closer are one
 _BLIND = 1e-3  # cᵀPc over cᵀc below which a star does not see a camera
 _MOST = 8  # places
-_WIDER = 2.0  # than the size that was looked for a place may be, and so far off its centre
+_WIDER = 2.0  # a fitted place may be larger by this factor, and lie off by so many sizes
 
 ColumnProducts = Float[np.ndarray, "c c"]
 Sizes = Float[np.ndarray, " c"]  # of all columns
@@ -87,9 +88,10 @@ Sizes = Float[np.ndarray, " c"]  # of all columns
 def scored(
     changes: Sequence[PossibleChange], matrix: ColumnProducts, score: Sizes, beside: Sequence[int] = ()
 ) -> list[PossibleChange]:
-    """Changes with size and error, each alone beside the others; those of numbers `beside` have no answer here.
+    """Changes with size and error, each tested by itself in a model that fits the changes number `beside`.
 
-    `matrix` and `score` are Q and g of the columns of all changes, then of what is fitted with them (priors included).
+    The changes `beside` come back as they are. `matrix` and `score` are Q and g: first of the columns of all changes,
+    then of the columns that are always fitted (priors included).
     """
     free = [n for n in range(len(changes)) if n not in beside]
     order = [*free, *beside, *range(len(changes), len(score))]
@@ -179,14 +181,14 @@ class CatalogueSearch(StarSearch):
         return np.concatenate([self.columns.all_of(part) @ self.mixing, self.errors(part)], axis=-1)
 
     def _left(self, sizes: Sizes) -> Residuals:
-        """Residuals behind changes of all columns."""
+        """The residuals less changes of all columns by these sizes."""
         if np.array_equal(sizes, self.start):
             return self.stars.residual
         amounts = sizes - self.start
         return self.stars.behind(self.stars.residual, lambda *part: self._columns(*part) @ amounts)
 
     def _looked(self, sizes: Sizes, *, stated: bool = False) -> _Look:
-        """Scales, Q and g (priors included) with these changes taken away; with `stated` of N_ERR as it is."""
+        """Scales, Q and g (priors included) of residuals less changes of these sizes; `stated`: N_ERR as it is."""
         stars, dof = self.stars, self.stars.dof.astype(float)
 
         def scale_of(residual: Residuals) -> Scale:
@@ -292,16 +294,20 @@ class CatalogueSearch(StarSearch):
         return tuple(dataclasses.replace(place, off=self.off(place.alike)) for place in places)
 
     def errors_of_calibration(self) -> Float[np.ndarray, " n"] | None:
-        """Errors of the calibration, in units of `root`, that explain the stars best; None if they cannot be.
+        """Errors of the calibration, in units of `root`, that explain the stars best; None if implausibly large.
 
-        Known once there is an `answer`: with N_ERR as stated, else with errors as large as the scatter.
+        To be called after `answer`. They are found with N_ERR as stated or, if that is implausible, with errors as
+        large as the scatter.
         """
         errors = np.zeros(len(self.matters))
         errors[self.matters] = self.nearest[self.asked : -2]
         return errors if is_near(errors[self.matters]) else None
 
     def bend(self, errors: Float[np.ndarray, " n"], residual: Residuals) -> float:
-        """Mean square, per degree of freedom, of the residuals with errors of the calibration less first order."""
+        """What first order misses of errors of the calibration: mean square, per degree of freedom, median over stars.
+
+        `residual` are the exact residuals with these errors; the residuals to first order are subtracted.
+        """
         sizes = self.start.copy()
         sizes[self.asked : -2] = errors[self.matters]
         off = self.stars.chi2(residual - self._left(sizes)) / self.variance
@@ -317,7 +323,10 @@ class CatalogueSearch(StarSearch):
     def _settled(
         self, look: _Look, sizes: Sizes, chosen: list[int], *, stated: bool = False
     ) -> tuple[_Look, Sizes]:
-        """Changes `chosen` and errors of the calibration fitted together, with the stars that this keeps."""
+        """The look and the sizes once changes `chosen` and errors of the calibration are fitted together.
+
+        Outliers are chosen anew in each step.
+        """
         fitted = np.array([*chosen, *range(self.asked, len(sizes))])
         for _ in range(_ROUNDS):
             matrix = look.matrix[np.ix_(fitted, fitted)]
@@ -348,8 +357,8 @@ def with_own_light(
 ) -> CatalogueCheck:
     """A check with what q and u of the stars say of the balance of the arms.
 
-    A change of a camera moves q and u as well as the sums of the cameras. What is found in both is told once: of
-    changes that describe the sums alike, those are kept behind which q and u follow the instrument no more.
+    A change of a camera moves q and u as well as the sums of the cameras. A change that both show is reported once: of
+    the changes that describe the sums alike, those are kept that, once subtracted, leave nothing to find in q and u.
     """
     named = [(cameras[first], cameras[second]) for first, second in arms]
     own, changes = own_light_check(light, named), [*check.changes]
@@ -363,7 +372,7 @@ def with_own_light(
             beside = own_light_check(light.without(share[:, None] * shift), named)
             if beside is not None and not beside.found:
                 kept.append((entry, beside))
-        if kept:  # light that is added, or grows, is not asked
+        if kept:  # added light is no share of the counts, and cannot be tested by q and u
             alike = (*(entry for entry, _ in kept), *(entry for entry in change.alike if not entry.relative))
             changes[n], own = dataclasses.replace(change, best=alike[0], alike=alike), kept[0][1]
             break
@@ -378,7 +387,7 @@ class _Look(NamedTuple):
 
 
 def _chance_beside(rows: Scale, noise: Scale) -> float:
-    """Probability that noise alone makes what rows share as large beside the scatter of all."""
+    """Probability that noise alone makes the common part of the rows of a star so large, beside the scatter of all."""
     if rows.worth <= 0 or noise.worth <= 0:
         return 1.0
     return float(special.fdtrc(rows.worth, noise.worth, rows.value / noise.value))
@@ -402,7 +411,7 @@ class Seen(NamedTuple):
         return Seen(*(values[chosen] for values in self))
 
     def near(self, place: SpotPlace) -> Seen:
-        """The stars that a place of several times its size may hold."""
+        """The stars that a spot at a place would reach if it were `_WIDER` times as large."""
         return self.of(profile(self.x, self.y, (*place[:2], _WIDER * place[2])) > 0)
 
 
@@ -422,7 +431,9 @@ def places_of(
     variance: OfStars | None = None,
     alarm: float = ALARM,
 ) -> tuple[DisagreeingPlace, ...]:
-    """Places of the field where stars disagree together, the most significant first; none in `alarm` of catalogues.
+    """Places of the field where stars disagree together, the most significant first.
+
+    Noise alone makes a place in a fraction `alarm` of all catalogues.
 
     `cameras` are names. `residual` is that of `stars`, with or without changes, `variance` that of the
     residuals of every star over that of its noise (None: `own_variance`).
@@ -444,7 +455,7 @@ def places_of(
 
 
 Sums = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""cᵀr, cᵀPc ahead of q and u, the root of what these take of it, and cᵀc: of rows, or summed over those of a star."""
+"""cᵀr; cᵀPc before q and u are fitted; the root of what q and u take of it; cᵀc. By row, or summed over a star."""
 
 
 def _sums(stars: StarResiduals, residual: Residuals, members: Float[np.ndarray, "k c"]) -> Sums:
@@ -584,7 +595,10 @@ def fitted(seen: Seen, camera: int, start: SpotPlace) -> SpotPlace:
 
 
 def described(seen: Seen, camera: int, place: SpotPlace, size: float) -> Bool[np.ndarray, " s"]:
-    """Stars whose shift is that of a camera at a place, to `CUT` standard errors or to half of it: spots have edges."""
+    """True for stars whose shift is the one that a spot of this `size` in a camera at a place predicts.
+
+    Allowed are `CUT` standard errors plus half of the predicted shift: spots have edges, which the profile has not.
+    """
     shift = size * seen.alpha[:, camera] * profile(seen.x, seen.y, place)
     return (shift != 0) & (np.abs(seen.z[:, camera] - shift) < CUT + 0.5 * np.abs(shift))
 

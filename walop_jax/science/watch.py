@@ -24,9 +24,9 @@ from walop_jax.science.star_history import Watching
 from walop_jax.science.star_residuals import StarResiduals
 from walop_jax.science.star_words import CALIBRATE, DATE_IT, Watch
 
-WATCHED_ROWS = 200_000  # of catalogues: a kilobyte each, and a camera is seen to 10⁻⁵
-MISREAD_ROWS = 2048  # of catalogues of which it means nothing
-_CERTAIN = 1e-9  # in their units: nothing is left to them as an error of the calibration
+WATCHED_ROWS = 200_000  # rows used at most, of a kilobyte each; they show gains of 10⁻⁵
+MISREAD_ROWS = 2048  # the same if a catalogue is doubted: what the watch finds then means nothing
+_CERTAIN = 1e-9  # standard error of the numbers of added effects, in their units: no error of the calibration
 
 
 def watch(
@@ -39,13 +39,13 @@ def watch(
 ) -> Watch:
     """Look for changes of the instrument since it was calibrated in the stars of catalogues.
 
-    Rows of one MJD are an exposure group; catalogues without it are a group each, in their order. Where some rows have
-    an MJD those without one are left out, and told by the `names` of their catalogues. Of more than `rows` rows as many
-    are looked at, spread over the stars. Each catalogue is first asked whether it is what it says (`readings_in`), with
-    all readings where the stars contradict the calibration as no change of it does. Where changes in
-    their course do not explain the stars, or there is one exposure group, each catalogue is asked as `apply` asks it:
-    what holds against it there holds here. Raises `DataError` as
-    `science.apply.apply` does, and where no row has a camera to spare.
+    Rows with the same MJD are an exposure group. If no row has an MJD, each catalogue is a group, in the given order;
+    if only some rows have one, the others are left out, and a remark names their catalogues (`names`). Of more than
+    `rows` rows a sample of `rows` is used, spread over the stars. Each catalogue is first tested for another reading
+    (`readings_in`): for all readings if the stars contradict the calibration as no change of it could. If changes in
+    time do not explain the stars, or if there is one exposure group, each catalogue is asked as `apply` asks it: what
+    holds against it there holds here. Raises `DataError` as `science.apply.apply` does, and if no star has a camera to
+    spare beside flux, q and u.
     """
     vectors = AnalysisVectors(with_rivals(calibration))
     given, told = list(zip(named(names, len(catalogues)), catalogues, strict=True)), len(catalogues) > 1
@@ -100,7 +100,10 @@ def named(names: Sequence[str], count: int) -> list[str]:
 
 
 def dated(catalogues: Sequence[Catalogue], names: Sequence[str]) -> tuple[list[Catalogue], tuple[str, ...]]:
-    """Catalogues with a time in every row, the number of the catalogue where none has any; remarks on rows left out."""
+    """Catalogues with a time in every row, and remarks on rows left out for want of one.
+
+    If no row has a time, it is the number of its catalogue.
+    """
     has_time = [np.isfinite(catalogue.time) for catalogue in catalogues]
     if not any(map(np.any, has_time)):
         numbered = enumerate(catalogues)
