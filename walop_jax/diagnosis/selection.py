@@ -209,9 +209,10 @@ class JointScores:
 
     def _grown(self, members: list[Member], allowed: Bool[np.ndarray, " n"] | None = None) -> list[Member]:
         """A set to which things are added, with exchanges, until nothing more is missing; of candidates `allowed`."""
-        while len(members) < thresholds.MOST_STEPS:
+        for _ in range(thresholds.MOST_STEPS):  # an exchange may drop a member, which is added again for ever
             best, total = self._best(members, allowed)
-            if special.expit(-(total + _odds())) > 1.0 - thresholds.CERTAIN:
+            nothing_more = special.expit(-(total + _odds()))
+            if nothing_more > 1.0 - thresholds.CERTAIN or len(members) == thresholds.MOST_STEPS:
                 break
             members = self._exchanged([*members, best], allowed)
         return members
