@@ -396,10 +396,10 @@ def catalogue_tables() -> str:
 
 
 def test_tables_of_effects_are_those_of_the_catalogue():
-    """Generated: what the page should say is what the assertion shows."""
-    page = section("effects", "The catalogue of effects")
+    page, tables = section("effects", "The catalogue of effects"), catalogue_tables().strip()
     start, stop = page.index("### Sky and stars"), page.index("`free_form` is not an effect")
-    assert page[start:stop].strip() == catalogue_tables().strip()
+    said = page[start:stop].strip() == tables
+    assert said, f"replace the tables of docs/effects.md, 'The catalogue of effects', by\n{tables}"
 
 
 def elements_table() -> str:
@@ -417,8 +417,9 @@ def elements_table() -> str:
 
 
 def test_table_of_elements_is_that_of_their_classes():
-    """Generated: what the page should say is what the assertion shows."""
-    assert elements_table() in section("adding-an-instrument", "Kinds of elements")
+    table = elements_table()
+    said = table in section("adding-an-instrument", "Kinds of elements")
+    assert said, f"replace the table of docs/adding-an-instrument.md, 'Kinds of elements', by\n{table}"
 
 
 def test_kinds_and_factors_of_descriptions_are_in_their_tables():

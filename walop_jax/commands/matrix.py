@@ -68,7 +68,7 @@ def matrix(
     from walop_jax.science.field_points import field_points
 
     if (points is None) == (x is None and y is None):
-        raise UsageError("give either x and y, or a table of points", "points")
+        raise UsageError("give the place: --x and --y, or a table of places", "points")
     if points is None and (x is None or y is None):
         raise UsageError("a field point needs both x and y", "y")
     if job.typed and points is not None and output is None:

@@ -72,6 +72,7 @@ def test_unknown_effect_lists_the_nearest():
 @every_effect
 def test_parameters_units_and_sources(kind: EffectKind):
     effect = kind.neutral(scenes.CONTEXT)
+    assert kind.name in CONTRACT, f"add {kind.name} to CONTRACT in {__file__}"
     expected = CONTRACT[kind.name]
     assert {name: d.unit for name, d in kind.numbers().items()} == {
         name: unit for name, unit in expected.items() if unit is not None
