@@ -450,10 +450,10 @@ def test_effects_that_look_alike_exist():
 def test_verdicts():
     from typing import get_args
 
-    from walop_jax.diagnosis.findings import Outcome
+    from walop_jax.diagnosis.findings import DiagnosisVerdict
 
     told = [row[0] for row in rows(section("effects", "How a diagnosis reports"))]
-    assert set(told) == set(get_args(Outcome))
+    assert set(told) == set(get_args(DiagnosisVerdict))
 
 
 def test_files_of_a_days_reading_exist():

@@ -261,11 +261,6 @@ GENERIC = {
     "Float", "Int", "Bool", "Shaped", "Inexact", "Complex", "tuple", "list", "dict", "set", "frozenset", "type",
     "Callable", "Mapping", "Sequence", "Iterable", "Iterator", "Collection", "Literal", "Minimum",
 }  # fmt: skip
-TO_BE_MOVED = (
-    "diagnosis/", "science/catalogue_doubts.py", "science/catalogue_readings.py", "science/star_residuals.py",
-    "science/star_history.py",
-)  # fmt: skip
-"""Files that still have aliases of their own under names that have another home: whoever changes one renames them."""
 
 
 def type_names(tree: ast.Module) -> Iterator[str]:
@@ -286,13 +281,13 @@ def class_names(tree: ast.Module) -> Iterator[str]:
     yield from (node.name for node in tree.body if isinstance(node, ast.ClassDef))
 
 
-@pytest.mark.parametrize(("names", "left_out"), [(class_names, ()), (type_names, TO_BE_MOVED)])
-def test_a_name_of_a_class_or_of_a_type_means_one_thing(names, left_out):
+@pytest.mark.parametrize("names", [class_names, type_names])
+def test_a_name_of_a_class_or_of_a_type_means_one_thing(names):
     """One home each; aliases of arrays of numpy that several files need live in `io/shapes.py`."""
     homes: dict[str, set[str]] = {}
     for path in files():
         home = path.relative_to(PACKAGE).as_posix()
-        for name in names(tree_of(path)) if not home.startswith(left_out or "-") else ():
+        for name in names(tree_of(path)):
             if not name.startswith("_"):
                 homes.setdefault(name, set()).add(home)
     assert {name: sorted(found) for name, found in homes.items() if len(found) > 1} == {}, (

@@ -18,7 +18,7 @@ from walop_jax.reports.survey_figures import watch_figure
 from walop_jax.science.catalogue import read_catalogue
 from walop_jax.science.star_columns import PossibleChange
 from walop_jax.science.star_history import Watching, grouped
-from walop_jax.science.star_residuals import Weights, noise_scale, normal_matrix
+from walop_jax.science.star_residuals import StarWeights, noise_scale, normal_matrix
 from walop_jax.science.star_words import FoundChange, Watch
 from walop_jax.science.watch import dated, watch, with_rivals
 
@@ -290,7 +290,7 @@ def test_a_change_that_nothing_within_its_range_describes_has_no_name(monkeypatc
 def test_what_single_exposures_cannot_see_is_nothing_and_not_rounding(vectors):
     """q and u of the stars are free: whatever does to all counts what q does has no information, of either sign."""
     stars = study.watching(120, 3, study.step(0.01), plates=(None,)).stars
-    ones, like_q = Weights(*np.ones((2, len(stars.photon)))), stars.tangent[:, 0]
+    ones, like_q = StarWeights(*np.ones((2, len(stars.photon)))), stars.tangent[:, 0]
     matrix, score = normal_matrix(stars, stars.residual, lambda part, _: part.tangent.swapaxes(1, 2), ones)
     assert not matrix.any()
     assert not score.any()

@@ -30,14 +30,15 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassMember, ClassOf, Sum, distinct, sentences_in
+from walop_jax.diagnosis.class_product import ClassMember, ClassOf, WeightedChanges, distinct, sentences_in
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import sentences_of
-from walop_jax.diagnosis.score import FAINTEST, Matrix, Vector, log_bayes
+from walop_jax.diagnosis.score import FAINTEST, log_bayes
 from walop_jax.diagnosis.synonyms import ALIKE
 from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.fit.refit import PRIOR_EDGE
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, patched
@@ -103,7 +104,7 @@ class LinearisedFit:
         self.template = model.template
         self.columns = self.design.columns
         self.usual = usual_exposure(calset, self.template)
-        self._added: dict[Sum, Float[np.ndarray, "p k 3"]] = {}
+        self._added: dict[WeightedChanges, Float[np.ndarray, "p k 3"]] = {}
         self.amplitudes = [i for name in model.effect_names for i in amplitude_positions(model, name)]
         far = (beyond_prior(self.fit, name).values() for name in model.effect_names)
         self.largest = PRIOR_EDGE * max(itertools.chain((1.0,), *far))
@@ -117,7 +118,9 @@ class LinearisedFit:
         self.covariance = self.fit.covariance[np.ix_(model.free, model.free)]
         self.errors = np.sqrt(np.einsum("pmf,fg,pmg->pm", self.slopes, self.covariance, self.slopes))
 
-    def added(self, sums: Sequence[Sum]) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
+    def added(
+        self, sums: Sequence[WeightedChanges]
+    ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
         """Analysis vectors of a star at the field points, and their derivatives with respect to each amplitude."""
         missing = [amplitude for amplitude in dict.fromkeys(sums) if amplitude not in self._added]
         if missing or self._vectors is None:
@@ -135,8 +138,8 @@ class LinearisedFit:
         self,
         name: str,
         at: Int[np.ndarray, " a"],
-        lost: Vector,
-        sums: tuple[Sum, ...],
+        lost: AnyVector,
+        sums: tuple[WeightedChanges, ...],
         alike: Collection[str],
         whole: frozenset[str],
     ) -> ClassOf:
@@ -212,7 +215,7 @@ class LinearisedFit:
 class LinearStep:
     """One linear step from the fit to a model without some amplitudes and with others."""
 
-    def __init__(self, laid: LinearisedFit, at: Int[np.ndarray, " a"], lost: Vector) -> None:
+    def __init__(self, laid: LinearisedFit, at: Int[np.ndarray, " a"], lost: AnyVector) -> None:
         self.laid, self.at = laid, at
         design = laid.design
         self.lost = np.pad(lost, (0, len(design.residual) - len(lost)))
@@ -220,7 +223,7 @@ class LinearStep:
         self.projector, self.basis = design.without(at)
         self.left = self.projector(design.residual + self.lost)
 
-    def addition(self, name: str, sums: tuple[Sum, ...]) -> tuple[ClassMember, Vector]:
+    def addition(self, name: str, sums: tuple[WeightedChanges, ...]) -> tuple[ClassMember, AnyVector]:
         """The addition itself as a member, with its fitted values, and its prior widths."""
         fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
         positions = fit.model.free[self.at]
@@ -280,7 +283,7 @@ class LinearStep:
             members.append((self.member(probe.name, sums, column, probe.widths, evidence), close))
         return best, members
 
-    def in_other_kinds(self, member: ClassMember, widths: Vector | None = None) -> ClassMember | None:
+    def in_other_kinds(self, member: ClassMember, widths: AnyVector | None = None) -> ClassMember | None:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
 
         None for a member that is not about one KIND. The `evidence` of the counterpart is given relative to that of the
@@ -319,7 +322,12 @@ class LinearStep:
         return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
 
     def member(
-        self, name: str, sums: tuple[Sum, ...], column: Matrix, widths: Vector, evidence: float | None = None
+        self,
+        name: str,
+        sums: tuple[WeightedChanges, ...],
+        column: AnyMatrix,
+        widths: AnyVector,
+        evidence: float | None = None,
     ) -> ClassMember:
         """The member with the amplitudes `sums` in the place of the addition, at the minimum of that model.
 
@@ -343,7 +351,7 @@ class LinearStep:
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
         return ClassMember(name, evidence, sums, change, amplitudes, covariance, values, slopes)
 
-    def _can_be_said(self, sums: Sequence[Sum]) -> bool:
+    def _can_be_said(self, sums: Sequence[WeightedChanges]) -> bool:
         """True if a model can include all sentences."""
         sentences = sentences_in(sums)
         stated = {text for effect in effects_of(self.laid.fit.model) for text in effect.stated}
@@ -360,6 +368,6 @@ class LinearStep:
         return True
 
 
-def _texts(sums: Sequence[Sum]) -> set[str]:
+def _texts(sums: Sequence[WeightedChanges]) -> set[str]:
     """The sentences of some amplitudes."""
     return {sentence.text for sentence in sentences_in(sums)}

@@ -25,8 +25,8 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.accuracy import GOAL
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.score import Matrix, Vector
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.io.text import per_cent, some, two_digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
@@ -35,11 +35,11 @@ from walop_jax.model.effects.in_models import effect_context, with_effects, with
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model
 
-Sum = tuple[tuple[float, Sentence], ...]
+WeightedChanges = tuple[tuple[float, Sentence], ...]
 """One amplitude: a sum of sentences with their coefficients."""
 
 
-def sentences_in(sums: Sequence[Sum]) -> list[Sentence]:
+def sentences_in(sums: Sequence[WeightedChanges]) -> list[Sentence]:
     """All sentences of some amplitudes."""
     return [sentence for amplitude in sums for _, sentence in amplitude]
 
@@ -54,12 +54,12 @@ class ClassMember(NamedTuple):
 
     name: str
     evidence: float
-    sums: tuple[Sum, ...]
+    sums: tuple[WeightedChanges, ...]
     change: Float[np.ndarray, "p m"]
-    amplitudes: Vector = np.zeros(0)
-    covariance: Matrix = np.zeros((0, 0))
-    values: Vector = np.zeros(0)
-    slopes: Matrix = np.zeros((0, 0))
+    amplitudes: AnyVector = np.zeros(0)
+    covariance: AnyMatrix = np.zeros((0, 0))
+    values: AnyVector = np.zeros(0)
+    slopes: AnyMatrix = np.zeros((0, 0))
     probability: float = 0.0
 
 
@@ -92,8 +92,8 @@ class Shape(NamedTuple):
     """
 
     changes: tuple[Sentence, ...]
-    moment: Matrix
-    slopes: Matrix
+    moment: AnyMatrix
+    slopes: AnyMatrix
     on_stars: tuple[int, ...]
     spread: float
     stated: float
@@ -118,7 +118,7 @@ class Classes(NamedTuple):
         return bool(self.additions) or self.shape is not None
 
     @property
-    def sums(self) -> list[Sum]:
+    def sums(self) -> list[WeightedChanges]:
         """Amplitudes of all members beside the additions themselves."""
         return [total for group in self.additions for member in group.members[1:] for total in member.sums]
 
@@ -244,7 +244,10 @@ def _said_by_name(model: Model) -> dict[str, tuple[str, float]]:
 
 
 def _derivatives(
-    model: Model, effect: str, sums: Sequence[Sum], said: Mapping[str, tuple[str, float]] | None = None
+    model: Model,
+    effect: str,
+    sums: Sequence[WeightedChanges],
+    said: Mapping[str, tuple[str, float]] | None = None,
 ) -> Float[np.ndarray, "n a"]:
     """Derivative of all parameters by amplitudes, each a sum of changes that an effect of the model holds.
 
@@ -280,7 +283,7 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 
-def _positive(matrix: Matrix) -> Matrix:
+def _positive(matrix: AnyMatrix) -> AnyMatrix:
     """The symmetric matrix without directions of negative variance, which differences of rounding make."""
     scale = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
     unit = np.where(scale > 0, scale, 1.0)
@@ -313,8 +316,8 @@ def only_a_class(classes: Classes) -> Iterator[str]:
 
 
 def mixture(
-    weights: Vector, values: Float[np.ndarray, "k n"], covariances: Sequence[Matrix]
-) -> tuple[Vector, Matrix]:
+    weights: AnyVector, values: Float[np.ndarray, "k n"], covariances: Sequence[AnyMatrix]
+) -> tuple[AnyVector, AnyMatrix]:
     """Mean and covariance over models of some probabilities, by the law of total variance."""
     mean = weights @ values
     away = values - mean
@@ -324,7 +327,7 @@ def mixture(
     return mean, covariance
 
 
-def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
+def known_apart_from(covariance: AnyMatrix, at: Int[np.ndarray, " k"]) -> AnyMatrix:
     """Conditional covariance of all others given the parameters `at`: C − C_a C_aa⁺ C_aᵀ, 0 in the rows of these."""
     across = covariance[:, at]
     conditional = covariance - across @ pseudo_inverse(covariance[np.ix_(at, at)], 1e-12) @ across.T
@@ -333,7 +336,7 @@ def known_apart_from(covariance: Matrix, at: Int[np.ndarray, " k"]) -> Matrix:
 
 
 def distinct(
-    evidence: Vector, changes: Float[np.ndarray, "k p m"], errors: Float[np.ndarray, "p m"], alike: float
+    evidence: AnyVector, changes: Float[np.ndarray, "k p m"], errors: Float[np.ndarray, "p m"], alike: float
 ) -> list[list[int]]:
     """Groups of equivalent models, the most probable of each first; best groups first.
 

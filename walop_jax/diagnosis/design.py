@@ -56,17 +56,10 @@ from numpy.polynomial.legendre import legvander
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.data.records import CalibrationSet, Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.score import (
-    Candidate,
-    Projector,
-    ScoreSpace,
-    ScoreTable,
-    Vector,
-    gram,
-    joined_in_batches,
-)
+from walop_jax.diagnosis.score import Candidate, Projector, ScoreSpace, ScoreTable, gram, joined_in_batches
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.robust import cut, states
+from walop_jax.io.shapes import AnyMatrix, AnyVector, ResidualCube
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.flux import project_flux
 from walop_jax.likelihood.inverses import determined, unit_columns, whitening
@@ -91,24 +84,21 @@ GAIN, LIGHT = Sort.GAIN, Sort.LIGHT
 SINGLE_EXPOSURES = "single exposures"
 STATES = "states"
 
-Cube = Float[np.ndarray, "p e k"]
-Pattern = Float[np.ndarray, "_ _"]
-
 
 class Measured:
     """The measurements at a best fit, laid out for building columns of residual derivatives."""
 
     def __init__(self, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
         self.likelihood, self.values = likelihood, values
-        self.weight: Cube = likelihood.points.gathered("weight")
-        self.counts: Cube = likelihood.points.gathered("counts")
+        self.weight: ResidualCube = likelihood.points.gathered("weight")
+        self.counts: ResidualCube = likelihood.points.gathered("counts")
         self.used: Bool[np.ndarray, "p e"] = likelihood.used
         self.flux, self.residual = likelihood.residuals(values)
         self.shared = likelihood.flux_groups
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
         residual = self.shared.independent(self.residual, inverse=True)
-        self.model: Cube = (self.counts * self.weight - residual) / flux
+        self.model: ResidualCube = (self.counts * self.weight - residual) / flux
         self.known = likelihood.flux_known
         self.cameras = likelihood.cameras
         # Of the model, not of the counts: patterns correlated with the noise would match it in the residuals.
@@ -116,20 +106,20 @@ class Measured:
         count = np.maximum(self.used.sum(axis=1), 1)[:, None]
         self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / count
 
-    def counts_changed_by(self, sort: Sort) -> Cube:
+    def counts_changed_by(self, sort: Sort) -> ResidualCube:
         """Counts, in standard errors, that a pattern of 1 everywhere adds to every camera as a gain, or as light."""
         unit = self.model if sort == GAIN else self.level[:, None, :] * self.weight
         return self.flux[..., None] * unit
 
-    def column(self, pattern: Cube, sort: Sort) -> Float[np.ndarray, " _"]:
+    def column(self, pattern: ResidualCube, sort: Sort) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of a pattern of gains, or of light."""
         return self._projected(self.counts_changed_by(sort) * pattern)
 
-    def derivative(self, change: Cube) -> Float[np.ndarray, " _"]:
+    def derivative(self, change: ResidualCube) -> Float[np.ndarray, " _"]:
         """Derivative of the residuals with respect to the amplitude of N_k → N_k + change, a change in counts."""
         return self._projected(change * self.weight)
 
-    def _projected(self, change: Cube) -> Float[np.ndarray, " _"]:
+    def _projected(self, change: ResidualCube) -> Float[np.ndarray, " _"]:
         """Derivative with respect to the amplitude of a change of the counts in standard errors: fluxes follow it."""
         projected = project_flux(change, self.model, self.known, self.shared)
         return -projected[self.used].reshape(-1)
@@ -202,7 +192,7 @@ class _Stratum(NamedTuple):
     name: str
     sort: Sort
     camera: Sequence[int]
-    patterns: Sequence[Pattern]
+    patterns: Sequence[AnyMatrix]
     block: str = ""
 
     @property
@@ -212,7 +202,7 @@ class _Stratum(NamedTuple):
 
 
 def _in_each(
-    cameras: Sequence[int], name: str, sort: Sort, patterns: Sequence[Pattern], block: str = ""
+    cameras: Sequence[int], name: str, sort: Sort, patterns: Sequence[AnyMatrix], block: str = ""
 ) -> _Stratum:
     """Each pattern in each of these cameras."""
     pairs = list(itertools.product(patterns, cameras))
@@ -337,7 +327,7 @@ class Design:
 
     fit: FitResult
     measured: Measured
-    residual: Vector
+    residual: AnyVector
     jacobian: Float[np.ndarray, "_ _"]
 
     @classmethod
@@ -411,7 +401,7 @@ class Design:
         products = [joined.T @ rows[: self.rows] for _, joined in joined_in_batches(columns)]
         return np.concatenate(products) / self.fit.noise_scale
 
-    def cube(self, rows: Vector) -> Float[np.ndarray, "p e k"]:
+    def cube(self, rows: AnyVector) -> Float[np.ndarray, "p e k"]:
         """Data rows put back into (point, exposure, camera); 0 where unused."""
         used = self.measured.used
         cube = np.zeros((*used.shape, self.measured.cameras))
@@ -484,7 +474,7 @@ def pattern_scores(design: Design, seed: int = 0) -> ScoreTable:
     return space.table(scores, square, space.smallest_p(np.random.default_rng(seed)))
 
 
-def _from_columns(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_columns(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, AnyVector, float]:
     """Space, C̃ᵀr and r·r from columns of all intensities."""
     columns = [design.measured.candidate(stratum).columns for stratum in all_strata]
     names, widths = [stratum.name for stratum in all_strata], [stratum.widths for stratum in all_strata]
@@ -493,7 +483,7 @@ def _from_columns(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpac
     return space, design.products(columns, residual), float(residual @ residual)
 
 
-def _from_rows(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, Vector, float]:
+def _from_rows(design: Design, all_strata: list[_Stratum]) -> tuple[ScoreSpace, AnyVector, float]:
     """The same from the rows of exposures and points."""
     measured, scale = design.measured, design.fit.noise_scale
     camera = np.concatenate([stratum.camera for stratum in all_strata])

@@ -43,7 +43,7 @@ from walop_jax.calibration.could_hide import CouldHide, could_hide, hidden_error
 from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.examination import Examination, Matrix, Vector, examine, most_points, smallest
+from walop_jax.diagnosis.examination import Examination, examine, most_points, smallest
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
@@ -55,6 +55,7 @@ from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.progress import Stage
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.io.text import per_cent, per_cent_range, two_digits, two_digits_range
 from walop_jax.model.effects import EffectKind
 from walop_jax.model.effects.in_models import known_effects
@@ -120,10 +121,10 @@ class DetectionLimits(Displayed):
 
     limits: tuple[DetectionLimit, ...]
     effects: tuple[str, ...]
-    separation: Matrix
-    x: Vector
-    y: Vector
-    protection: Vector
+    separation: AnyMatrix
+    x: AnyVector
+    y: AnyVector
+    protection: AnyVector
     caused_by: tuple[str, ...]
     untestable: tuple[str, ...]
     conditions: tuple[ConditionLimit, ...] = ()

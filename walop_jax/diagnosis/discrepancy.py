@@ -42,12 +42,13 @@ from scipy import special
 
 from walop_jax.calibration.matrix import of_matrix
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
-from walop_jax.diagnosis.class_product import Classes, Shape, Sum
+from walop_jax.diagnosis.class_product import Classes, Shape, WeightedChanges
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.score import SCALES, Matrix, Vector, log_bayes_by_scale
+from walop_jax.diagnosis.score import SCALES, log_bayes_by_scale
 from walop_jax.fit.refit import FitResult
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import square_root
 from walop_jax.model.effects import Described, FreeForm
@@ -81,7 +82,9 @@ def ambiguities(
     )
 
 
-def _slopes(laid: LinearisedFit, sums: Sequence[Sum], values: Matrix) -> Float[np.ndarray, "p m a"]:
+def _slopes(
+    laid: LinearisedFit, sums: Sequence[WeightedChanges], values: AnyMatrix
+) -> Float[np.ndarray, "p m a"]:
     """Slopes of the elements of the matrix in amplitudes, which change the free parameters by `values` as well."""
     vectors, added = laid.added(sums)
     direct = of_matrix(vectors[:, None], np.moveaxis(added, -1, 1), laid.template.cameras.pairs)
@@ -98,7 +101,7 @@ def shape_of(laid: LinearisedFit) -> Shape | None:
     changes, widths, laws = shape_changes(laid.fit, laid.columns)
     if not changes:
         return None
-    sums: tuple[Sum, ...] = tuple(((1.0, change),) for change in changes)
+    sums: tuple[WeightedChanges, ...] = tuple(((1.0, change),) for change in changes)
     step = laid.nothing_removed
     column = laid.design.stacked([laid.columns.of(sums)])
     member = step.member("", sums, column, widths, 0.0)
@@ -129,7 +132,7 @@ class _Place(NamedTuple):
     origin: str
 
 
-def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Vector, set[tuple[str, ...]]]:
+def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], AnyVector, set[tuple[str, ...]]]:
     """Deviations from the shapes of the descriptions in a model, their prior widths, and the laws described."""
     instrument = fit.model.instrument(fit.values)
     if not any(isinstance(effect, Described) for effect in instrument.effects):
@@ -216,12 +219,12 @@ class _Block(NamedTuple):
     residuals; `slopes` is the change of the free parameters by each.
     """
 
-    sums: tuple[Sum, ...]
-    widths: Vector
+    sums: tuple[WeightedChanges, ...]
+    widths: AnyVector
     groups: tuple[list[int], ...]
-    gram: Matrix
-    scores: Vector
-    slopes: Matrix
+    gram: AnyMatrix
+    scores: AnyVector
+    slopes: AnyMatrix
 
 
 def undetected(laid: LinearisedFit) -> Shape | None:
@@ -291,7 +294,7 @@ def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, pla
     )  # fmt: skip
 
 
-def _second_moments(blocks: Sequence[_Block], floor: float) -> list[Matrix]:
+def _second_moments(blocks: Sequence[_Block], floor: float) -> list[AnyMatrix]:
     """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
     odds, moments = _odds(sum(len(block.groups) for block in blocks)), []
     for block in blocks:
@@ -309,7 +312,9 @@ def _odds(groups: int) -> float:
     return float(np.log(prior / (1.0 - prior) / len(SCALES)))
 
 
-def _second_moment(gram: Matrix, scores: Vector, widths: Vector, odds: float, floor: float) -> Matrix:
+def _second_moment(
+    gram: AnyMatrix, scores: AnyVector, widths: AnyVector, odds: float, floor: float
+) -> AnyMatrix:
     """E[c cᵀ] of the amplitudes of a group, over its scales and its absence."""
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
     value, along = np.clip(value, 0.0, None), vector.T @ (scores * widths)
@@ -319,7 +324,7 @@ def _second_moment(gram: Matrix, scores: Vector, widths: Vector, odds: float, fl
     return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
 
 
-def _of_other_light(laid: LinearisedFit, step: LinearStep) -> Matrix:
+def _of_other_light(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
     """F, with F Fᵀ the covariance of the free parameters by undetected changes that act on no star.
 
     These are the candidates of an examination that depend on time, temperature, KIND, counts or an exposure, or that
@@ -348,7 +353,7 @@ def _no_starlight(probe: Probe, template: Instrument) -> bool:
     )
 
 
-def _carrying(columns: Matrix, factor: Matrix) -> tuple[list[int], Matrix]:
+def _carrying(columns: AnyMatrix, factor: AnyMatrix) -> tuple[list[int], AnyMatrix]:
     """Few `columns`, and loadings L, with columns[:, chosen] L Lᵀ columns[:, chosen]ᵀ close to factor factorᵀ.
 
     One after the other the column that explains most of the rest, until less than `LEFT_OUT` is left.

@@ -45,6 +45,7 @@ from walop_jax.diagnosis.stated_conditions import STEP, stated_numbers
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.io.errors import DataError
+from walop_jax.io.progress import Tell
 from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
@@ -57,8 +58,7 @@ _LOOKED = 8  # causes that take a step, of more those that the screen finds best
 _HELPS = 0.9  # of the misfit, that the first of two causes leaves at most by itself
 _EXCHANGED = 5  # worst exposures, of which two may have been exchanged
 
-Tell = Callable[[str], None]
-Stage = Callable[[], Iterable[Alternative]]
+CauseSearch = Callable[[], Iterable[Alternative]]
 
 
 def silent(_: str) -> None:
@@ -160,7 +160,7 @@ def _compared(
         return look.first_of(
             [lambda: of_some, lambda: of_all, lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
         )
-    whole: list[Stage] = [lambda: look.screen.best(of_instrument), lambda: of_some, lambda: of_all]
+    whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: of_some, lambda: of_all]
     if found := look.first_of(whole, look.enough):
         return found
     if descriptions and (found := _stated_otherwise(likelihood, left, values)):
@@ -180,7 +180,7 @@ def _compared(
         for sentence in alternatives(model.template)
         if descriptions and OtherDescription.name not in model.effect_names
     ]
-    further: list[Stage] = [lambda: look.screen.best(described)] if described else []
+    further: list[CauseSearch] = [lambda: look.screen.best(described)] if described else []
     if found := look.first_of([*further, lambda: instruments(few)], look.enough):
         return found
     tell("comparing two discrete causes at once")
@@ -265,7 +265,7 @@ class _Look:
         """The χ²/dof below which a cause explains the data."""
         return min(1.0 + (self.left - 1.0) / thresholds.PART, FAR_OFF)
 
-    def first_of(self, stages: Iterable[Stage], enough: float) -> tuple[Alternative, ...]:
+    def first_of(self, stages: Iterable[CauseSearch], enough: float) -> tuple[Alternative, ...]:
         """The causes of the first stage that leave nothing but noise, best first; empty: none."""
         for stage in stages:
             found = self.explaining(stage(), enough)

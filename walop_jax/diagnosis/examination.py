@@ -24,19 +24,11 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import GAIN, SINGLE_EXPOSURES, Design, number_of_columns, strata
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates
-from walop_jax.diagnosis.score import (
-    Candidate,
-    Matrix,
-    Score,
-    ScoreSpace,
-    ScoreTable,
-    Vector,
-    log_bayes,
-    separations,
-)
+from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, log_bayes, separations
 from walop_jax.diagnosis.synonyms import synonyms
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import SUSPECT_SIGMA
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.instrument import Instrument
@@ -59,7 +51,7 @@ def rank(table: ScoreTable, probes: Sequence[Probe]) -> list[Ranked]:
     return sorted(ranked, key=lambda item: -item.log_bayes)
 
 
-def follow_physics(probe: Probe, amplitudes: Vector, covariance: Matrix) -> bool:
+def follow_physics(probe: Probe, amplitudes: AnyVector, covariance: AnyMatrix) -> bool:
     """True if a linear step leaves one-sided amplitudes on their side, within `thresholds.SEPARATION`."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     return bool(np.all((amplitudes >= -thresholds.SEPARATION * sigma)[probe.one_sided]))
@@ -99,7 +91,7 @@ class Evidence:
     """
 
     space: ScoreSpace
-    scores: Vector
+    scores: AnyVector
     square: float
     table: ScoreTable
     probes: Sequence[Probe]
@@ -275,7 +267,7 @@ class Examination(Evidence):
     bare: ScoreSpace
 
     @property
-    def columns(self) -> list[Matrix]:
+    def columns(self) -> list[AnyMatrix]:
         """Columns of all candidates."""
         return [candidate.columns for candidate in self.candidates.values()]
 
@@ -292,12 +284,12 @@ class Examination(Evidence):
             effect.name for effect in catalogue if effect.name not in testable and not effect.is_structural()
         )
 
-    def space_beside(self, basis: Matrix) -> tuple[Matrix, ScoreSpace]:
+    def space_beside(self, basis: AnyMatrix) -> tuple[AnyMatrix, ScoreSpace]:
         """Products of all columns with a basis of parameters that are taken out (`Design.without`); the space then."""
         along = self.design.products(self.columns, basis)
         return along, self.bare.with_known(along)
 
-    def separation(self, name: str, change: Vector) -> dict[str, float]:
+    def separation(self, name: str, change: AnyVector) -> dict[str, float]:
         """Distance (σ) of each rival from an active effect that changes the residuals (data rows) by `change`."""
         design, columns = self.design, self.columns
         rest, basis = design.without(design.columns_of(self.result.model.positions(name)))
@@ -385,7 +377,7 @@ def examine(
     )
 
 
-def common_mode(space: ScoreSpace, design: Design) -> Vector:
+def common_mode(space: ScoreSpace, design: Design) -> AnyVector:
     """Prior widths of the gains of single exposures that amount to `thresholds.COMMON_MODE` per intensity."""
     at = space.places()[SINGLE_EXPOSURES]
     points = np.repeat(design.measured.used.sum(axis=0), len(design.measured.gained))

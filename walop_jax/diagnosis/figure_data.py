@@ -27,10 +27,11 @@ from walop_jax.data.hdus import sign_and_write, table_hdu
 from walop_jax.data.records import Exposures, Points
 from walop_jax.data.schema import Column, read_table
 from walop_jax.data.units import Place
-from walop_jax.diagnosis.findings import HARMONICS, Cube, Diagnosis
+from walop_jax.diagnosis.findings import HARMONICS, Diagnosis
 from walop_jax.io.atomic import atomic_path
 from walop_jax.io.errors import fail
 from walop_jax.io.fits_reading import open_fits
+from walop_jax.io.shapes import ResidualCube
 from walop_jax.io.text import in_ascii
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import FreeForm
@@ -38,7 +39,7 @@ from walop_jax.model.effects import FreeForm
 DIAGVERS = 1
 """Version of the file format that is written, and the newest that is read."""
 
-Table = Mapping[str, Shaped[np.ndarray, " _"]]
+FigureColumns = Mapping[str, Shaped[np.ndarray, " _"]]
 """Columns of a table by name."""
 
 PointMap = Float[np.ndarray, "p k"]
@@ -117,9 +118,9 @@ class DiagnosisFigureData:
     """
 
     points: Points
-    exposures: Table
-    ladder: Table
-    shares: Table
+    exposures: FigureColumns
+    ladder: FigureColumns
+    shares: FigureColumns
     comparisons: tuple[ResidualComparison, ...]
 
     @property
@@ -235,7 +236,7 @@ class _Combination:
     weight: Weight
     harmonic: int = -1
 
-    def of(self, cube: Cube, used: Used) -> PointMap:
+    def of(self, cube: ResidualCube, used: Used) -> PointMap:
         """The combined residuals of every point and camera; NaN where too few of the exposures are used."""
         present = used @ self.weight**2
         norm = np.where(present > LEAST_COVERAGE, np.sqrt(present), np.nan)
@@ -272,7 +273,7 @@ def _unnamed_term(diagnosis: Diagnosis) -> bool:
 
 
 def compare_residuals(
-    effect: str, before: Cube, after: Cube, used: Used, exposures: Exposures
+    effect: str, before: ResidualCube, after: ResidualCube, used: Used, exposures: Exposures
 ) -> ResidualComparison:
     """Two cubes of residuals (σ; 0 where unused) side by side, in the combination that shows their difference.
 
@@ -299,7 +300,7 @@ def compare_residuals(
     return ResidualComparison(effect, best.words, best.harmonic, field, curves)
 
 
-def best_combination(cube: Cube, used: Used, exposures: Exposures) -> _Combination:
+def best_combination(cube: ResidualCube, used: Used, exposures: Exposures) -> _Combination:
     """The combination of the exposures in which a pattern (σ) shows best, in words wherever that is possible."""
 
     def power(combination: _Combination) -> float:
@@ -313,7 +314,7 @@ def best_combination(cube: Cube, used: Used, exposures: Exposures) -> _Combinati
     return named if power(named) >= WORDS_FROM * power(free) else free
 
 
-def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combination]:
+def _in_words(cube: ResidualCube, used: Used, exposures: Exposures) -> Iterator[_Combination]:
     measured = used.any(axis=0)
     through = exposures.clp_in & measured
     angle = np.deg2rad(np.where(through, exposures.clp_angle, 0.0))
@@ -335,7 +336,7 @@ def _in_words(cube: Cube, used: Used, exposures: Exposures) -> Iterator[_Combina
         yield _Combination("trend with time", hours / np.linalg.norm(hours))
 
 
-def _ladder(diagnosis: Diagnosis) -> Table:
+def _ladder(diagnosis: Diagnosis) -> FigureColumns:
     """Starting model, every addition, and the final fit where it differs from that of the last addition."""
     final = diagnosis.after
     rungs = [("starting model", diagnosis.before.chi2, diagnosis.before.dof)]
@@ -346,7 +347,7 @@ def _ladder(diagnosis: Diagnosis) -> Table:
     return {"MODEL": np.array(model), "CHI2": np.array(chi2, float), "DOF": np.array(freedom, int)}
 
 
-def _shares(likelihood: Likelihood, before: Cube, after: Cube) -> Table:
+def _shares(likelihood: Likelihood, before: ResidualCube, after: ResidualCube) -> FigureColumns:
     """Sums of squared residuals by camera, kind, filter and exposure."""
     e, names = likelihood.calset.exposures, likelihood.model.template.cameras.names
     share = likelihood.data_per_row / len(names)

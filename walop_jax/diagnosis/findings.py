@@ -20,6 +20,7 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
+from walop_jax.io.shapes import ResidualCube
 from walop_jax.io.text import per_cent, plain, probability, some, value_and_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
@@ -140,8 +141,7 @@ def _trend(e: Exposures, settings: Int[np.ndarray, " e"], rms: Float[np.ndarray,
     return float(residuals[0] @ residuals[1]) / (size[0] * size[1])
 
 
-Outcome = Literal["consistent", "effect_found", "wrong_number", "unexplained"]
-Cube = Float[np.ndarray, "p e k"]
+DiagnosisVerdict = Literal["consistent", "effect_found", "wrong_number", "unexplained"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,8 +161,8 @@ class FitComparison:
     heldout_before: float = float("nan")
     heldout_after: float = float("nan")
     change_of_qu: float = float("nan")
-    residual_before: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
-    residual_after: Cube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+    residual_before: ResidualCube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
+    residual_after: ResidualCube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
 
     @property
     def confirmed(self) -> bool:
@@ -294,7 +294,7 @@ class Diagnosis(Drawn):
 
     _first_figure = "ladder"
 
-    verdict: Outcome
+    verdict: DiagnosisVerdict
     steps: tuple[Step, ...]
     candidates: tuple[tuple[str, float, float], ...]
     limits: tuple[Mapping[str, Any], ...]

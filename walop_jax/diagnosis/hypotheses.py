@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis.score import Candidate, Score, Vector
+from walop_jax.diagnosis.score import Candidate, Score
+from walop_jax.io.shapes import AnyVector
 from walop_jax.io.text import rounded
 from walop_jax.likelihood.columns import Columns, SumOfSentences, own_columns
 from walop_jax.model.dependence import conditions_of_effect
@@ -50,7 +51,7 @@ class Probe:
         return tuple(name for member, name in pairs for _ in range(np.size(getattr(member, name))))
 
     @functools.cached_property
-    def widths(self) -> Vector:
+    def widths(self) -> AnyVector:
         """Prior widths of the amplitudes, member by member."""
         return np.array([w for member in self.group for w in member.prior_widths(self.context).values()])
 

@@ -35,7 +35,7 @@ _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 _FEW_FILTERS = 4  # up to which any two may be exchanged
 _LISTED = 8  # exposures that a sentence lists
 
-Change = Callable[[CalibrationSet], CalibrationSet]
+DataChange = Callable[[CalibrationSet], CalibrationSet]
 
 
 def unchanged(calset: CalibrationSet) -> CalibrationSet:
@@ -54,7 +54,7 @@ class Alternative:
 
     what: str
     remedy: str
-    change: Change = unchanged
+    change: DataChange = unchanged
     effects: tuple[Effect, ...] = ()
     explained: float = np.inf
     number: str = ""
@@ -86,7 +86,7 @@ class Alternative:
         )
 
 
-def _one_after_the_other(first: Change, second: Change) -> Change:
+def _one_after_the_other(first: DataChange, second: DataChange) -> DataChange:
     """Both changes of a set; none where neither changes it."""
     if first is unchanged:
         return second
@@ -283,7 +283,7 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
         )
 
 
-def with_block(change: Callable[[Block], dict[str, np.ndarray]]) -> Change:
+def with_block(change: Callable[[Block], dict[str, np.ndarray]]) -> DataChange:
     """A set with other intensities: `change` gives the arrays that differ."""
 
     def changed(calset: CalibrationSet) -> CalibrationSet:
@@ -302,21 +302,21 @@ def _exchanged(calset: CalibrationSet, pair: tuple[int, int]) -> CalibrationSet:
     return dataclasses.replace(calset, exposures=swapped)
 
 
-def with_part(part: str, change: Callable[[Any], Any]) -> Change:
+def with_part(part: str, change: Callable[[Any], Any]) -> DataChange:
     """A set with another of its parts: its exposures, sources or site."""
     return lambda calset: dataclasses.replace(calset, **{part: change(getattr(calset, part))})
 
 
-def with_values(part: str, name: str, turn: Callable[[Any], Any]) -> Change:
+def with_values(part: str, name: str, turn: Callable[[Any], Any]) -> DataChange:
     """A set with other values of one name in a part of it."""
     return with_part(part, lambda old: dataclasses.replace(old, **{name: turn(getattr(old, name))}))
 
 
-def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> Change:
+def _with_column(column: str, turn: Callable[[np.ndarray], np.ndarray]) -> DataChange:
     return with_values("exposures", column, turn)
 
 
-def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Change:
+def _with_sources(turn: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> DataChange:
     def change(old: Sources) -> Sources:
         q, u = turn(old.q, old.u)
         return dataclasses.replace(old, q=q, u=u)
@@ -443,7 +443,7 @@ def _fields(calset: CalibrationSet, model: Model) -> Iterator[Alternative]:
             )
 
 
-def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
+def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> DataChange:
     """A set with other coordinates: `turn` takes and gives X and Y."""
 
     def change(calset: CalibrationSet) -> CalibrationSet:
@@ -455,14 +455,14 @@ def with_places(turn: Callable[..., tuple[np.ndarray, np.ndarray]]) -> Change:
     return change
 
 
-def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> Change:
+def _with_angle(prefix: str, turned: Callable[[np.ndarray], np.ndarray]) -> DataChange:
     return with_part(
         "exposures", lambda e: e.placed(**{prefix: Position.at(turned(e.position(prefix).angle))})
     )
 
 
 _AT = "give degrees, or the unit of the column"
-_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], Change], ...] = (
+_TABLE: tuple[tuple[str, str, Callable[[CalibrationSet, Exposures], bool], DataChange], ...] = (
     ("U of SOURCES had the other sign", "give −U (docs: conventions)", _has_stars, _with_sources(lambda q, u: (q, -u))),
     ("Q of SOURCES had the other sign", "give −Q (docs: conventions)", _has_stars, _with_sources(lambda q, u: (-q, u))),
     ("Q and U of SOURCES both had the other sign", "give −Q and −U", _has_stars, _with_sources(lambda q, u: (-q, -u))),

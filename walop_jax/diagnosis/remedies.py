@@ -39,11 +39,11 @@ class Remedy(NamedTuple):
     worth: float
 
 
-Judge = Callable[[FitResult], bool]
+IsNoise = Callable[[FitResult], bool]
 """True of a fit whose residuals hold no pattern, no component and no group that scatters otherwise."""
 
 
-def remedies(result: FitResult, is_noise: Judge) -> tuple[str, ...]:
+def remedies(result: FitResult, is_noise: IsNoise) -> tuple[str, ...]:
     """The sentences of what turns the residuals of a poor fit into noise, the best remedy first, improbable ones not.
 
     `result` is of field points, few enough to be examined.
@@ -54,7 +54,7 @@ def remedies(result: FitResult, is_noise: Judge) -> tuple[str, ...]:
     return tuple(remedy.sentence for remedy in probable)
 
 
-def _of_errors(result: FitResult, is_noise: Judge) -> Iterator[Remedy]:
+def _of_errors(result: FitResult, is_noise: IsNoise) -> Iterator[Remedy]:
     """The errors of the data as a part of the model (`model.noise`): a scale of N_ERR, or a fraction of the counts."""
     sentences = {"scale": too_small(result), "fraction": ""}
     for term in sentences:

@@ -35,17 +35,16 @@ from jaxtyping import Bool, Float, Int
 from scipy import linalg, special
 
 from walop_jax.io.code import cores
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import limits
 from walop_jax.likelihood.inverses import unit_columns, whitening
 
 NULL_DRAWS = 1_000
 """Draws of all scores under the base model: a fifth of them give the number of trials to 7 %."""
 
-Vector = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "_ _"]
 Gram = Any
 """A symmetric matrix whose entries are asked for by index: an array, `Repeated`, `Less` or `Blocks`."""
-Reduction = Callable[[Vector, float], tuple[Vector, float]]
+Reduction = Callable[[AnyVector, float], tuple[AnyVector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
@@ -66,8 +65,8 @@ class Candidate:
     """
 
     name: str
-    columns: Matrix
-    widths: Vector
+    columns: AnyMatrix
+    widths: AnyVector
     block: str = ""
 
 
@@ -83,7 +82,7 @@ class Score:
     statistic: float
     rank: int
     log_p: float
-    amplitudes: Vector
+    amplitudes: AnyVector
     covariance: Float[np.ndarray, "k k"]
     log_bayes: float
 
@@ -100,7 +99,7 @@ class Projector:
     was solved for. `free` is the number left for noise, `basis` an orthonormal basis of the part removed.
     """
 
-    def __init__(self, jacobian: Matrix, eliminated: int = 0) -> None:
+    def __init__(self, jacobian: AnyMatrix, eliminated: int = 0) -> None:
         self._jacobian, self.basis = jacobian, np.linalg.qr(unit_columns(jacobian)[0])[0]
         self.free = jacobian.shape[0] - jacobian.shape[1] - eliminated
 
@@ -151,7 +150,7 @@ def local_p(p: float, trials: float) -> float:
     return float(-np.expm1(np.log1p(-p) / max(trials, 1)))
 
 
-def effective_trials(smallest: Vector) -> float:
+def effective_trials(smallest: AnyVector) -> float:
     """Effective number of independent candidates, from draws of ln of the smallest p."""
     count = int(TAIL * len(smallest))
     if not count:
@@ -176,8 +175,8 @@ class ScoreSpace:
 
     names: tuple[str, ...]
     sizes: tuple[int, ...]
-    widths: Vector
-    before: Vector
+    widths: AnyVector
+    before: AnyVector
     gram: Gram
     free: int
 
@@ -186,8 +185,8 @@ class ScoreSpace:
         cls,
         projector: Projector,
         names: Sequence[str],
-        widths: Sequence[Vector],
-        columns: Sequence[Matrix],
+        widths: Sequence[AnyVector],
+        columns: Sequence[AnyMatrix],
         *,
         scale: float = 1.0,
         exact: int | None = None,
@@ -246,16 +245,18 @@ class ScoreSpace:
         return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)
 
     @functools.cached_property
-    def whitened(self) -> Mapping[str, Matrix]:
+    def whitened(self) -> Mapping[str, AnyMatrix]:
         """By candidate its `whitening`, with no part in it of amplitudes that are not alive."""
         return {name: whitening(self._of_alive(at)) for name, at in self.places().items()}
 
-    def _of_alive(self, at: slice) -> Matrix:
+    def _of_alive(self, at: slice) -> AnyMatrix:
         """A block of the Gram matrix, 0 for amplitudes that are not alive."""
         alive = self.alive[at]
         return np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
 
-    def with_base(self, names: Sequence[str], widths: Vector | None = None) -> tuple[ScoreSpace, Reduction]:
+    def with_base(
+        self, names: Sequence[str], widths: AnyVector | None = None
+    ) -> tuple[ScoreSpace, Reduction]:
         """The space when some candidates have joined the base, and what takes (C̃ᵀr, r·r) there.
 
         With `widths`, one for each of their amplitudes, these are nuisances that are known that well beforehand.
@@ -266,14 +267,14 @@ class ScoreSpace:
         w = whitening(self.gram[np.ix_(place, place)] + np.diag(inverse))
         along = self.gram[:, place] @ w
 
-        def reduce(scores: Vector, square: float) -> tuple[Vector, float]:
+        def reduce(scores: AnyVector, square: float) -> tuple[AnyVector, float]:
             explained = w.T @ scores[place]
             return scores - along @ explained, square - float(explained @ explained)
 
         free = self.free - (w.shape[1] if widths is None else 0)
         return dataclasses.replace(self, gram=Less.of(self.gram, along, along), free=free), reduce
 
-    def with_known(self, along: Matrix) -> ScoreSpace:
+    def with_known(self, along: AnyMatrix) -> ScoreSpace:
         """The space when directions that were taken out of the columns are in them again; `along` are their parts."""
         return dataclasses.replace(self, gram=Less.of(self.gram, -along, along))
 
@@ -283,13 +284,13 @@ class ScoreSpace:
     def _root(self) -> _Root:
         return _Root(self.gram, self.alive)
 
-    def table_after(self, earlier: ScoreTable, scores: Vector) -> ScoreTable:
+    def table_after(self, earlier: ScoreTable, scores: AnyVector) -> ScoreTable:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
         noise, trials = earlier.noise_scale, earlier.trials
         table, best = self._scored(scores, noise)
         return ScoreTable(table, noise, corrected_p(best, trials), trials)
 
-    def table(self, scores: Vector, square: float, smallest: Vector | None = None) -> ScoreTable:
+    def table(self, scores: AnyVector, square: float, smallest: AnyVector | None = None) -> ScoreTable:
         """The table from s = C̃ᵀr and r·r, both behind the projection; `smallest` are draws of `smallest_p`."""
         noise_square = max(square - self._root.explained(scores), 0.0)
         freedom = self.free - self._root.rank
@@ -304,7 +305,7 @@ class ScoreSpace:
         p = (1 + below) / (1 + len(smallest)) if often else corrected_p(best, trials)
         return ScoreTable(table, noise, p, trials)
 
-    def _scored(self, scores: Vector, noise: float) -> tuple[tuple[Score, ...], float]:
+    def _scored(self, scores: AnyVector, noise: float) -> tuple[tuple[Score, ...], float]:
         """The scores of all candidates, and ln of the smallest p of those that are testable (0: none is)."""
         table = list[Score]()
         for name, at in self.places().items():
@@ -320,7 +321,7 @@ class ScoreSpace:
             table.append(score)
         return tuple(table), min((score.log_p for score in table if score.testable), default=0.0)
 
-    def smallest_p(self, rng: np.random.Generator, draws: int = NULL_DRAWS) -> Vector:
+    def smallest_p(self, rng: np.random.Generator, draws: int = NULL_DRAWS) -> AnyVector:
         """ln of the smallest p among all candidates, drawn under the base."""
         if not self._root.rank:
             return np.zeros(0)
@@ -328,7 +329,7 @@ class ScoreSpace:
         root = self._root.whole
         return self.smallest_of(root @ rng.standard_normal((draws, root.shape[1]), dtype=np.float32).T)
 
-    def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> Vector:
+    def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> AnyVector:
         """ln of the smallest p among all candidates in each draw of the scores C̃ᵀr, for noise of unit size."""
         smallest = np.zeros(drawn.shape[1])
         for name, at in self.places().items():
@@ -349,7 +350,11 @@ class Repeated:
     """
 
     def __init__(
-        self, distinct: Matrix, number: Int[np.ndarray, " _"], factor: Vector, blocks: Sequence[Matrix]
+        self,
+        distinct: AnyMatrix,
+        number: Int[np.ndarray, " _"],
+        factor: AnyVector,
+        blocks: Sequence[AnyMatrix],
     ) -> None:
         self.distinct, self.number, self.factor = distinct, number, factor
         sizes = np.array([len(block) for block in blocks], int)
@@ -373,12 +378,12 @@ class Repeated:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:, :], dtype)
 
-    def diagonal(self) -> Vector:
+    def diagonal(self) -> AnyVector:
         """Entries of the diagonal."""
         return self._in_blocks[self._row + self._local]
 
 
-def multiples(columns: Sequence[Matrix], exact: int) -> tuple[Int[np.ndarray, " _"], Vector]:
+def multiples(columns: Sequence[AnyMatrix], exact: int) -> tuple[Int[np.ndarray, " _"], AnyVector]:
     """For every column the first of which it is a multiple, and the factor; the first `exact` are their own.
 
     Found by a few sums of their entries with random weights, and held against each other in single precision.
@@ -388,7 +393,7 @@ def multiples(columns: Sequence[Matrix], exact: int) -> tuple[Int[np.ndarray, " 
     if exact >= count:
         return first_of, factor
     weights = np.random.default_rng(0).standard_normal((max(map(len, columns)), SKETCHES))
-    known: dict[bytes, tuple[int, Vector, float]] = {}
+    known: dict[bytes, tuple[int, AnyVector, float]] = {}
     for at, joined in joined_in_batches(columns):
         length = np.sqrt(np.einsum("dk,dk->k", joined, joined))
         sketch = weights[: len(joined)].T @ joined
@@ -414,11 +419,11 @@ class Less:
     Indices are those of an array of numpy with two axes.
     """
 
-    def __init__(self, whole: Gram, left: Matrix, right: Matrix) -> None:
+    def __init__(self, whole: Gram, left: AnyMatrix, right: AnyMatrix) -> None:
         self.whole, self.left, self.right = whole, left, right
 
     @classmethod
-    def of(cls, matrix: Gram, left: Matrix, right: Matrix) -> Less:
+    def of(cls, matrix: Gram, left: AnyMatrix, right: AnyMatrix) -> Less:
         """A matrix less another product L Rᵀ."""
         if not isinstance(matrix, Less):
             return cls(matrix, left, right)
@@ -431,7 +436,7 @@ class Less:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:, :], dtype)
 
-    def diagonal(self) -> Vector:
+    def diagonal(self) -> AnyVector:
         """Entries of the diagonal."""
         return self.whole.diagonal() - np.sum(self.left * self.right, axis=1)
 
@@ -439,16 +444,16 @@ class Less:
 class Blocks:
     """A matrix that is 0 but for square blocks along its diagonal, which alone are asked for: `matrix[at, at]`."""
 
-    def __init__(self, blocks: Sequence[Matrix]) -> None:
+    def __init__(self, blocks: Sequence[AnyMatrix]) -> None:
         stop = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = blocks
         self._by_place = dict(zip(itertools.pairwise(stop), blocks, strict=True))
 
-    def __getitem__(self, index: tuple[slice, slice]) -> Matrix:
+    def __getitem__(self, index: tuple[slice, slice]) -> AnyMatrix:
         rows, _ = index
         return self._by_place[rows.start, rows.stop]
 
-    def diagonal(self) -> Vector:
+    def diagonal(self) -> AnyVector:
         """Entries of the diagonal."""
         return np.concatenate([block.diagonal() for block in self._blocks])
 
@@ -494,7 +499,7 @@ class _Root:
         )
         self.whole[every] = root[of] * scale[:, None].astype(np.float32)
 
-    def explained(self, scores: Vector) -> float:
+    def explained(self, scores: AnyVector) -> float:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""
         if not self.rank:
             return 0.0
@@ -502,7 +507,7 @@ class _Root:
         return float(solution @ solution)
 
 
-def log_bayes(gram: Matrix, scores: Vector, widths: Vector, scales: Vector = SCALES) -> float:
+def log_bayes(gram: AnyMatrix, scores: AnyVector, widths: AnyVector, scales: AnyVector = SCALES) -> float:
     """ln B of a linear effect against the base: exact, that of several numbers averaged over scales t of their widths.
 
         B = ⟨exp(½ sᵀ (G + Λ⁻¹/t²)⁻¹ s) / det(1 + t² Λ^½ G Λ^½)^½⟩ over t, Λ^½ the prior widths
@@ -538,7 +543,7 @@ def _survival_grid(rank: int) -> tuple[np.ndarray, np.ndarray]:
     return grid, _log_of_chi2(grid, rank)
 
 
-def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, float]:
+def separations(space: ScoreSpace, scores: AnyVector, square: float) -> dict[str, float]:
     """Distance (σ) of each candidate from a change D of the residuals when it does its best to follow.
 
     `scores` are C̃ᵀD and `square` D·D, both behind the projection (Atkinson & Fedorov 1975, Biometrika 62, 57).
@@ -550,7 +555,7 @@ def separations(space: ScoreSpace, scores: Vector, square: float) -> dict[str, f
 # ------------------------------------------------------------------------------------------- products of large matrices
 
 
-def joined_in_batches(columns: Sequence[Matrix]) -> Iterator[tuple[slice, Matrix]]:
+def joined_in_batches(columns: Sequence[AnyMatrix]) -> Iterator[tuple[slice, AnyMatrix]]:
     """The columns of all blocks side by side in float64, so many at a time as take little memory, and their places."""
     stop = np.cumsum([0, *(block.shape[1] for block in columns)])
     rows = max(1, max(map(len, columns), default=1))
@@ -569,7 +574,7 @@ def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[n
     return products
 
 
-def _add_upper(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int | None) -> None:
+def _add_upper(products: AnyMatrix, columns: Float[np.ndarray, "d n"], exact: int | None) -> None:
     """Add CᵀC as in `gram`, piece by piece, to the pieces on and above the diagonal."""
     count = columns.shape[1]
     single = columns if exact is None or exact >= count else columns.astype(np.float32)
@@ -585,7 +590,7 @@ def _add_upper(products: Matrix, columns: Float[np.ndarray, "d n"], exact: int |
         list(pool.map(product, itertools.combinations_with_replacement(pieces, 2)))
 
 
-def _mirror(products: Matrix) -> None:
+def _mirror(products: AnyMatrix) -> None:
     """Copy what is above the diagonal to below it."""
     for first in range(0, len(products), limits.COLUMNS_TOGETHER):
         at = slice(first, first + limits.COLUMNS_TOGETHER)

@@ -40,7 +40,7 @@ STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
 BEST = 3  # causes that are looked at again, and beside which a second one is sought
 _ROUNDS = 3  # times that the size of a step is determined anew
 
-Rows = Float[np.ndarray, " d"]
+RowChanges = Float[np.ndarray, " d"]
 
 
 class Screen:
@@ -63,19 +63,19 @@ class Screen:
         self.exposure = np.repeat(np.nonzero(self.used)[1], likelihood.cameras)
         self.basis = self.basis[:count]
         self.stands = self.rows(likelihood)
-        self._changed: dict[str, Rows | None] = {}
+        self._changed: dict[str, RowChanges | None] = {}
 
     @property
     def calset(self) -> CalibrationSet:
         """The set as it stands."""
         return self.likelihood.calset
 
-    def rows(self, likelihood: Likelihood, values: Vector | None = None) -> Rows:
+    def rows(self, likelihood: Likelihood, values: Vector | None = None) -> RowChanges:
         """Residuals of a set or model changed, at the values of the screen or others; 0 where not used."""
         residual = likelihood.residuals(self.values if values is None else values)[1]
         return np.where(likelihood.used[..., None], residual, 0.0)[self.used].reshape(-1) / self.scale
 
-    def sums(self, rows: Rows) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e f"]]:
+    def sums(self, rows: RowChanges) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e f"]]:
         """Of every exposure the sum of squares, and its part of Qᵀr."""
         count = self.used.shape[1]
         square = np.bincount(self.exposure, rows**2, minlength=count)
@@ -95,13 +95,13 @@ class Screen:
         square, along = (part.sum(axis=0) for part in self.sums(self.stands))
         return float(self.left(square, along))
 
-    def changed(self, item: Alternative) -> Rows | None:
+    def changed(self, item: Alternative) -> RowChanges | None:
         """Residuals with a cause; None where it cannot be asked."""
         if item.what not in self._changed:
             self._changed[item.what] = self._residuals_with(item)
         return self._changed[item.what]
 
-    def _residuals_with(self, item: Alternative) -> Rows | None:
+    def _residuals_with(self, item: Alternative) -> RowChanges | None:
         try:
             if item.effects and not self.likelihood.model.effect_names:
                 rows = self.rows(*self._arranged(item))

@@ -26,7 +26,7 @@ from walop_jax.diagnosis.exact import Trial, beyond_prior
 from walop_jax.diagnosis.examination import Evidence, explains
 from walop_jax.diagnosis.findings import Choice, descriptions_of
 from walop_jax.diagnosis.hypotheses import Ranked
-from walop_jax.diagnosis.selection import Posterior, Thing, most_probable
+from walop_jax.diagnosis.selection import MissingThings, Thing, most_probable
 from walop_jax.model.effects import Described
 
 MOST_LISTED = 40
@@ -160,7 +160,7 @@ class _RoundInProgress:
 
     state: State
     judge: Judge
-    posterior: Posterior
+    posterior: MissingThings
     fits: int
     choices: Mapping[str, Choice]
     trials: dict[str, Trial] = dataclasses.field(default_factory=dict)

@@ -44,12 +44,13 @@ from scipy import special
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.score import SCALES, Vector, log_bayes_by_scale
+from walop_jax.diagnosis.score import SCALES, log_bayes_by_scale
+from walop_jax.io.shapes import AnyVector
 from walop_jax.model.effects import Described
 
 MOST_EXCHANGES = 10  # rounds after one addition; only candidates that are equal would change places for ever
 
-Member = tuple[int, float]
+SetMember = tuple[int, float]
 """A candidate by its position, and the scale t of the prior of its amplitudes."""
 
 
@@ -84,7 +85,7 @@ class Thing:
 
 
 @dataclasses.dataclass(frozen=True)
-class Posterior:
+class MissingThings:
     """The most probable set of things that are missing in one fit, the one with the most evidence first.
 
     `nothing_more` is the probability that nothing is missing beside them.
@@ -105,7 +106,7 @@ class Posterior:
         return self.nothing_more > 1.0 - thresholds.CERTAIN and not patterns and few
 
 
-def most_probable(evidence: Evidence) -> Posterior:
+def most_probable(evidence: Evidence) -> MissingThings:
     """The most probable set of things that are missing in a fit."""
     return JointScores(evidence).posterior()
 
@@ -154,7 +155,7 @@ class JointScores:
 
     # --------------------------------------------------------------------------------------------- evidence
 
-    def beside(self, members: Sequence[Member]) -> Float[np.ndarray, "n t"]:
+    def beside(self, members: Sequence[SetMember]) -> Float[np.ndarray, "n t"]:
         """ln B of every candidate at each scale of its prior, in a model with `members`; −∞ where it has none."""
         along, taken = self._taken_up(members)
         scores = self.scores - along @ taken
@@ -174,7 +175,7 @@ class JointScores:
                 found[chosen, : len(scales)] += _on_its_side(one_sided, vector, spread, turned)
         return found
 
-    def _taken_up(self, members: Sequence[Member]) -> tuple[Float[np.ndarray, "a m"], Vector]:
+    def _taken_up(self, members: Sequence[SetMember]) -> tuple[Float[np.ndarray, "a m"], AnyVector]:
         """The part of all columns, and of the scores, that `members` explain."""
         if not members:
             return np.zeros((len(self.widths), 0)), np.zeros(0)
@@ -187,13 +188,13 @@ class JointScores:
         root = np.linalg.cholesky(products[at] * scale[:, None] + np.eye(len(at)))
         return np.linalg.solve(root, products.T).T, np.linalg.solve(root, scale * self.scores[at])
 
-    def over_scales(self, found: Float[np.ndarray, "n t"]) -> Vector:
+    def over_scales(self, found: Float[np.ndarray, "n t"]) -> AnyVector:
         """ln B of every candidate, averaged over the scales."""
         return np.logaddexp.reduce(found, axis=1) - np.log(self.scales_of)
 
     # ------------------------------------------------------------------------------------------- the search
 
-    def posterior(self) -> Posterior:
+    def posterior(self) -> MissingThings:
         """The most probable set of things.
 
         Where it has a pattern without a name, a second search begins with names alone, and the more probable set of
@@ -205,9 +206,11 @@ class JointScores:
             members = max(members, self._grown(self._grown([], self.is_named)), key=self._total)
         nothing_more = float(special.expit(-(self._best(members)[1] + _odds())))
         things = sorted(self._things(members), key=lambda thing: -thing.log_evidence)
-        return Posterior(tuple(things), nothing_more)
+        return MissingThings(tuple(things), nothing_more)
 
-    def _grown(self, members: list[Member], allowed: Bool[np.ndarray, " n"] | None = None) -> list[Member]:
+    def _grown(
+        self, members: list[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> list[SetMember]:
         """A set to which things are added, with exchanges, until nothing more is missing; of candidates `allowed`."""
         for _ in range(thresholds.MOST_STEPS):  # an exchange may drop a member, which is added again for ever
             best, total = self._best(members, allowed)
@@ -217,7 +220,7 @@ class JointScores:
             members = self._exchanged([*members, best], allowed)
         return members
 
-    def _total(self, members: Sequence[Member]) -> float:
+    def _total(self, members: Sequence[SetMember]) -> float:
         """ln of the posterior of a set, but for a constant of all sets."""
         total = 0.0
         for count, (number, scale) in enumerate(members):
@@ -225,11 +228,11 @@ class JointScores:
             total += float(bayes + self.log_prior[number] - np.log(self.scales_of[number])) + _odds()
         return total
 
-    def _odds_of_patterns(self, worth: Vector) -> float:
+    def _odds_of_patterns(self, worth: AnyVector) -> float:
         """ln [P(any pattern) / P(any name)]; `worth` is ln B π of every candidate."""
         return _log_sum(worth[~self.is_named]) - _log_sum(worth[self.is_named])
 
-    def _probable(self, members: Sequence[Member]) -> tuple[Vector, Float[np.ndarray, "n t"]]:
+    def _probable(self, members: Sequence[SetMember]) -> tuple[AnyVector, Float[np.ndarray, "n t"]]:
         """ln of B π of every candidate beside some members, and its evidence by scale."""
         found = self.beside(members)
         worth = self.over_scales(found) + self.log_prior
@@ -237,8 +240,8 @@ class JointScores:
         return worth, found
 
     def _best(
-        self, members: Sequence[Member], allowed: Bool[np.ndarray, " n"] | None = None
-    ) -> tuple[Member, float]:
+        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> tuple[SetMember, float]:
         """The most probable candidate for a model that has `members`, and ln Σ B π, over those `allowed` (all)."""
         worth, found = self._probable(members)
         if allowed is not None:
@@ -247,8 +250,8 @@ class JointScores:
         return (number, float(SCALES[np.argmax(found[number])])), float(np.logaddexp.reduce(worth))
 
     def _exchanged(
-        self, members: list[Member], allowed: Bool[np.ndarray, " n"] | None = None
-    ) -> list[Member]:
+        self, members: list[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> list[SetMember]:
         """The members, each replaced by the most probable candidate beside the others, until nothing changes."""
         for _ in range(MOST_EXCHANGES):
             before = list(members)
@@ -267,7 +270,7 @@ class JointScores:
                 break
         return members
 
-    def _things(self, members: Sequence[Member]) -> Iterator[Thing]:
+    def _things(self, members: Sequence[SetMember]) -> Iterator[Thing]:
         """The things of a set, each with its names."""
         for member in members:
             others = [one for one in members if one != member]
@@ -279,7 +282,7 @@ class JointScores:
             yield Thing(self.probes.get(name, name), float(bayes[number]), *self._named(bayes), patterns)
 
     def _named(
-        self, bayes: Vector
+        self, bayes: AnyVector
     ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[Probe, ...]]]:
         """Probabilities of all names by their own and by equal priors, and the shapes of names of the set."""
         worth = bayes + self.log_prior

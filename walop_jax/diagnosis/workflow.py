@@ -29,7 +29,7 @@ from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.discrete import causes_before_a_fit, causes_of, refusal
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import Diagnosis, Outcome, Step, describe, descriptions_of
+from walop_jax.diagnosis.findings import Diagnosis, DiagnosisVerdict, Step, describe, descriptions_of
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
@@ -135,7 +135,7 @@ def diagnose(
         state, remainder = beside_conditions(first, state, remainder, conditions)
     after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, added) for step in state.steps)
-    verdict: Outcome = "effect_found" if steps else "consistent"
+    verdict: DiagnosisVerdict = "effect_found" if steps else "consistent"
     if remainder is not None:
         verdict = "wrong_number" if remainder.number else "unexplained"
     tell("examining the residuals")
@@ -273,5 +273,5 @@ def _about(effect: Effect, cameras: Sequence[str]) -> str:
     """An effect in words, with its place: "a dark spot in front of one camera, O2"."""
     first = (effect.kind.__doc__ or effect.name).strip().splitlines()[0].rstrip(".")
     chosen = spoken_choices(effect)
-    places = [cameras[value] if name == "camera" else str(value) for name, value in chosen.items()]
-    return ", ".join([first[:1].lower() + first[1:], *places])
+    places = [str(cameras[value]) if name == "camera" else str(value) for name, value in chosen.items()]
+    return ", ".join((first[:1].lower() + first[1:], *places))

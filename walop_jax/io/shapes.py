@@ -32,3 +32,7 @@ ByRowAndCamera = Float[np.ndarray, "r k"]
 """A number for each of some rows r of a table, and each camera k."""
 RowIndex = Int[np.ndarray, " r"]
 """Numbers of some rows of a table, from 0."""
+ResidualCube = Float[np.ndarray, "p e k"]
+"""A number for each of p field points, e exposures and k cameras."""
+ColumnProducts = Float[np.ndarray, "c c"]
+"""Products of c columns with each other."""

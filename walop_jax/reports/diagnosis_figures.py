@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from walop_jax.data.records import Points
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.detection_limits import NO_LEVEL, DetectionLimits
-from walop_jax.diagnosis.figure_data import DiagnosisFigureData, PointMap, ResidualComparison, Table
+from walop_jax.diagnosis.figure_data import DiagnosisFigureData, FigureColumns, PointMap, ResidualComparison
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.reports import style
 from walop_jax.reports.style import PAGE, AnyFigure, Canvas, styled
@@ -98,7 +98,7 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
 
 @styled
 def signature_figure(
-    comparison: ResidualComparison, exposures: Table, cameras: Sequence[str], on: Canvas = PAGE
+    comparison: ResidualComparison, exposures: FigureColumns, cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
     """Residuals averaged over the field, camera by camera: data as dots, the part of the effect as a line.
 
@@ -128,7 +128,9 @@ def signature_figure(
     return figure
 
 
-def _abscissa(comparison: ResidualComparison, exposures: Table) -> tuple[bool, Float[np.ndarray, " e"], str]:
+def _abscissa(
+    comparison: ResidualComparison, exposures: FigureColumns
+) -> tuple[bool, Float[np.ndarray, " e"], str]:
     """True for polariser angles, positions along the axis, its label."""
     behind, mjd = np.isfinite(exposures["CLP_ANGLE"]), exposures["MJD"]
     explained = comparison.curves["EXPLAINED"]
@@ -153,7 +155,7 @@ def _binned(x: Float[np.ndarray, " e"], *columns: Float[np.ndarray, " e"]) -> li
 
 
 @styled
-def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
+def ladder_figure(ladder: FigureColumns, on: Canvas = PAGE) -> AnyFigure:
     """χ²/dof of the starting model and all after it, logarithmic; in the band (5 σ) a model explains the data."""
     names = [*ladder["MODEL"]]
     names = [names[0], *(name if name == "final fit" else f"+ {name}" for name in names[1:])]
@@ -183,7 +185,7 @@ def ladder_figure(ladder: Table, on: Canvas = PAGE) -> AnyFigure:
 
 
 @styled
-def shares_figure(shares: Table, on: Canvas = PAGE) -> AnyFigure:
+def shares_figure(shares: FigureColumns, on: Canvas = PAGE) -> AnyFigure:
     """Mean squared residual by camera, kind, filter and exposure, over what noise alone gives: before and after."""
     groups = [g for g in ("camera", "kind", "filter") if np.count_nonzero(shares["GROUP"] == g) > 1]
     widths = [float(np.count_nonzero(shares["GROUP"] == g) + 1) for g in groups]

@@ -15,13 +15,11 @@ from jaxtyping import Bool, Float, Int
 from walop_jax.data import plausible, user_tables
 from walop_jax.data.user_tables import InputTable
 from walop_jax.io.errors import rows_text
+from walop_jax.io.shapes import CountsOfRows, Vector
 from walop_jax.io.text import with_minus_sign
 from walop_jax.science.field_points import ANOTHER_PLACE
 from walop_jax.science.other_readings import MIRRORED
 from walop_jax.sky.directions import Pointing
-
-OfRows = Float[np.ndarray, " n"]
-Counts = Float[np.ndarray, "n k"]
 
 BRIGHT = 1000.0  # electrons: errors of larger counts are a few per cent, a tenth with a read noise of 100 electrons
 QUIET = 0.02  # of the variance of photons: what a mean of fifty exposures has
@@ -34,7 +32,7 @@ _POSITIONS, _FEWEST, _SPREAD = 2000, 5, 0.02
 """Rows that are looked at, and needed; share of their extent by which positions of several fields scatter."""
 
 
-def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
+def units_of_counts(counts: CountsOfRows, sigma: CountsOfRows) -> Iterator[str]:
     """Sentences if N_ERR cannot be the errors of counts N in electrons: one of the two is in another unit."""
     lit = np.isfinite(counts) & (counts > 0)
     bright = lit & (sigma > 0) & (np.maximum(counts, sigma) > BRIGHT)
@@ -60,12 +58,12 @@ def units_of_counts(counts: Counts, sigma: Counts) -> Iterator[str]:
         yield f"N_ERR of bright stars is {share:.2g} times N: are these variances? Standard errors are wanted; {number}"
 
 
-def _like_photons(sigma: OfRows, counts: OfRows) -> bool:
+def _like_photons(sigma: Vector, counts: Vector) -> bool:
     """True if errors are those of counts in electrons, with a noise of sky and detectors as it is usual."""
     return 0.8 < float(np.median(sigma**2 / counts)) < _NOISIER
 
 
-def field_against_sky(source: InputTable, x: OfRows, y: OfRows, rotator: OfRows) -> Iterator[str]:
+def field_against_sky(source: InputTable, x: Vector, y: Vector, rotator: Vector) -> Iterator[str]:
     """Sentences where X, Y and ROTATOR contradict RA and DEC of the same table (docs: conventions).
 
     Positions of one pointing are a linear map of those on the tangent plane, whose rotation and sign are known.
@@ -124,7 +122,7 @@ def _apart(one: float, other: float) -> float:
     return (one - other + 180.0) % 360.0 - 180.0
 
 
-def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> Iterator[str]:
+def errors_of_cameras(counts: CountsOfRows, sigma: CountsOfRows, names: Sequence[str]) -> Iterator[str]:
     """Remarks on errors of a camera (electrons) that exceed its counts in all rows, or are the same in all rows."""
     used = np.isfinite(counts) & np.isfinite(sigma)
     for k, name in enumerate(names):
@@ -135,12 +133,12 @@ def errors_of_cameras(counts: Counts, sigma: Counts, names: Sequence[str]) -> It
             yield f"N_ERR of {name} is {error[on][0]:g} in all rows, whatever N is: is it a placeholder?"
 
 
-def not_measured(counts: Counts, sigma: Counts) -> Bool[np.ndarray, "n k"]:
+def not_measured(counts: CountsOfRows, sigma: CountsOfRows) -> Bool[np.ndarray, "n k"]:
     """True where N and N_ERR are the same negative number, which catalogues write for a value that is missing."""
     return (counts < 0) & (counts == sigma)
 
 
-def stars_of_one_name(star: Int[np.ndarray, " n"], x: OfRows, y: OfRows, time: OfRows) -> Iterator[str]:
+def stars_of_one_name(star: Int[np.ndarray, " n"], x: Vector, y: Vector, time: Vector) -> Iterator[str]:
     """A sentence if many stars have rows at several places of the field at the same time."""
     dated = np.flatnonzero(np.isfinite(time + x + y))
     exposure = np.unique(time[dated], return_inverse=True)[1].reshape(-1)
@@ -159,7 +157,7 @@ def stars_of_one_name(star: Int[np.ndarray, " n"], x: OfRows, y: OfRows, time: O
 
 
 def ceilings(
-    counts: Counts, used: Bool[np.ndarray, " n"], names: Sequence[str]
+    counts: CountsOfRows, used: Bool[np.ndarray, " n"], names: Sequence[str]
 ) -> Iterator[plausible.Implausible]:
     """Faults of counts that are the largest in several rows: one if all cameras share it, else one for each."""
     top = np.nanmax(np.where(used[:, None], counts, -np.inf), initial=-np.inf)
@@ -174,7 +172,7 @@ def ceilings(
         yield from plausible.of_ceilings(counts, used, names)
 
 
-def many_are_full(counts: Counts) -> bool:
+def many_are_full(counts: CountsOfRows) -> bool:
     """True if the largest count of all cameras stands in more rows than single saturated stars explain."""
     full = counts == np.nanmax(counts, initial=-np.inf)
     return bool(np.mean(full.any(axis=1)) > _SHARE and full.sum() >= _FEWEST)

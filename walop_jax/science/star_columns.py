@@ -54,7 +54,7 @@ _REFERENCE = 1e6  # electron
 
 SpotPlace = tuple[float, ...]  # centre (X, Y) and size of a spot, in degrees, and the sharpness of its edge
 RowValues = Float[np.ndarray, " r"]  # a number for each row
-Sum = dict[int, float]  # weights of columns by their numbers
+WeightedColumns = dict[int, float]  # weights of columns by their numbers
 
 
 def threshold(chance: float) -> float:
@@ -194,8 +194,8 @@ class Question(NamedTuple):
     kind: str
     name: str
     unit: str
-    along: Sum
-    across: Sum | None = None
+    along: WeightedColumns
+    across: WeightedColumns | None = None
     widest: float = np.inf
 
     @property

@@ -33,6 +33,7 @@ from jaxtyping import Float, Int
 from scipy import special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
+from walop_jax.io.shapes import ColumnProducts
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import star_columns as alarms
 from walop_jax.science import star_residuals as residuals
@@ -45,12 +46,12 @@ from walop_jax.science.star_columns import (
     History,
     PossibleChange,
     Question,
-    Sum,
+    WeightedColumns,
     profile,
     rivals_of,
     threshold,
 )
-from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights
+from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, StarWeights
 from walop_jax.science.star_search import Seen, StarSearch, Strongest, fitted, scored
 from walop_jax.science.star_words import FoundChange, Watch
 
@@ -72,8 +73,7 @@ def grouped(time: Float[np.ndarray, " r"], most: int = MOST_GROUPS) -> tuple[OfG
 
 
 OfGroups = Float[np.ndarray, " g"]
-Matrix = Float[np.ndarray, "c c"]
-Score = Float[np.ndarray, " c"]
+ColumnScores = Float[np.ndarray, " c"]
 Settled = tuple[FoundChange, Residuals]  # a change, and the residuals behind it
 
 
@@ -120,7 +120,7 @@ class Watching(StarSearch):
 
     # --------------------------------------------------------------------------------------------- noise
 
-    def weights(self, residual: Residuals) -> tuple[Weights, Scale]:
+    def weights(self, residual: Residuals) -> tuple[StarWeights, Scale]:
         """Weights of the stars, and the scale of all of them.
 
         A change that stars of a night have in common is no noise: where χ² is not what N_ERR says, weights come from
@@ -137,7 +137,7 @@ class Watching(StarSearch):
                 weights, _, off = rescaled
         return weights, scale
 
-    def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[Weights, Scale, bool]:
+    def _scaled(self, residual: Residuals, fitted: OfGroups) -> tuple[StarWeights, Scale, bool]:
         """Weights, the scale of all stars, and whether any scale differs from that of N_ERR.
 
         `fitted` is how many numbers were fitted in each group before.
@@ -163,9 +163,11 @@ class Watching(StarSearch):
             larger = residuals.of_few(local, self.alarm) if fitted.any() else 1.0
             variance = max(local.value, least) * larger if mine else common
             weight[members], share[members] = np.where(local.kept, 1.0 / variance, 0.0), local.share
-        return Weights(weight / self.variance, share), overall, several
+        return StarWeights(weight / self.variance, share), overall, several
 
-    def _behind_gains(self, residual: Residuals, weights: Weights, count: int) -> tuple[Residuals, OfGroups]:
+    def _behind_gains(
+        self, residual: Residuals, weights: StarWeights, count: int
+    ) -> tuple[Residuals, OfGroups]:
         """Residuals less the best fit of the first `count` columns in each group; the numbers fitted in each."""
         groups = len(self.time)
         blocks, slopes = self._by_group(*self.scan(residual, weights))
@@ -182,7 +184,7 @@ class Watching(StarSearch):
 
     # -------------------------------------------------------------------------------------------- columns
 
-    def scan(self, residual: Residuals, weights: Weights) -> tuple[Matrix, Score]:
+    def scan(self, residual: Residuals, weights: StarWeights) -> tuple[ColumnProducts, ColumnScores]:
         """Q and g of `columns` in all groups (group, column), errors of the calibration eliminated."""
         stars, count, groups = self.stars, self.columns.count + len(self.columns.optics), len(self.time)
         nuisances = self.root.shape[1] + 2
@@ -250,7 +252,7 @@ class Watching(StarSearch):
             blocks -= (flat.T @ flat).reshape(blocks.shape)
 
     def _by_group(
-        self, matrix: Matrix, score: Score
+        self, matrix: ColumnProducts, score: ColumnScores
     ) -> tuple[Float[np.ndarray, "g k g k"], Float[np.ndarray, "g k"]]:
         """Q and g of `scan` by group and change."""
         slopes = score.reshape(len(self.time), -1)
@@ -304,7 +306,9 @@ class Watching(StarSearch):
         noise, odd = self._scatter(residual, weights, scale)
         return dataclasses.replace(self.told(changes, matrix, score, noise), odd=odd)
 
-    def _scatter(self, residual: Residuals, weights: Weights, scale: Scale) -> tuple[float, tuple[str, ...]]:
+    def _scatter(
+        self, residual: Residuals, weights: StarWeights, scale: Scale
+    ) -> tuple[float, tuple[str, ...]]:
         """χ² per degree of freedom of all stars, 1 where N_ERR says so; a remark on stars that lie off by themselves.
 
         Nothing is said that errors of the calibration explain.
@@ -332,7 +336,7 @@ class Watching(StarSearch):
 
     def _explained(self, residual: Residuals, scale: Scale) -> Residuals:
         """Residuals behind the errors of the calibration that explain them best, if these are as chance makes them."""
-        stated = Weights(scale.kept / self.variance, scale.share)
+        stated = StarWeights(scale.kept / self.variance, scale.share)
         matrix, score = residuals.normal_matrix(
             self.stars, residual, lambda *part: self.errors(part[0]), stated
         )
@@ -361,17 +365,17 @@ class Watching(StarSearch):
             change = dataclasses.replace(change, alike=change.alike + alternative.alike)
         return change, remaining
 
-    def answers(self, matrix: Matrix, score: Score) -> Answers:
+    def answers(self, matrix: ColumnProducts, score: ColumnScores) -> Answers:
         """Size and error of every question with every history, each tested by itself."""
         (blocks, slopes), shapes = self._by_group(matrix, score), self.shapes
         size = shapes.shape[1], len(self.questions)
         answers = Answers(np.zeros(size), np.full(size, np.inf), np.zeros(size))
 
-        def information(one: Sum, across: Sum) -> Float[np.ndarray, " h"]:
+        def information(one: WeightedColumns, across: WeightedColumns) -> Float[np.ndarray, " h"]:
             terms = [v * w * blocks[:, a, :, b] for a, v in one.items() for b, w in across.items()]
             return np.einsum("gh,gf,fh->h", shapes, np.sum(terms, axis=0), shapes, optimize=True)
 
-        def slope(of: Sum) -> Float[np.ndarray, " h"]:
+        def slope(of: WeightedColumns) -> Float[np.ndarray, " h"]:
             return shapes.T @ np.sum([weight * slopes[:, a] for a, weight in of.items()], axis=0)
 
         trace = np.einsum("gkgk->k", blocks)
@@ -428,7 +432,7 @@ class Watching(StarSearch):
         when = float(self.time[best.history.start]), (float(began.min()), float(began.max()))
         return FoundChange(best, tuple(alike), *when, off=self.off([best, *alike]))
 
-    def spotted(self, residual: Residuals, weights: Weights) -> Settled | None:
+    def spotted(self, residual: Residuals, weights: StarWeights) -> Settled | None:
         """A step in a spot of the field, and the residuals behind it; None where noise makes as much."""
         # Stars that were left out as outliers may be those of the spot: here they have the weight of all others.
         common = np.zeros(len(self.time) + 1)
@@ -474,7 +478,7 @@ class Watching(StarSearch):
         return self._dated(best, alike), self.without(residual, best, best.size)
 
     def _sized(
-        self, residual: Residuals, asked: list[PossibleChange], weights: Weights
+        self, residual: Residuals, asked: list[PossibleChange], weights: StarWeights
     ) -> list[PossibleChange]:
         """Changes with size and error, each alone, the most significant first; without those that no star sees."""
 
@@ -489,7 +493,9 @@ class Watching(StarSearch):
             (entry for entry in sized if np.isfinite(entry.error)), key=lambda entry: -abs(entry.sigma)
         )
 
-    def told(self, changes: list[FoundChange], matrix: Matrix, score: Score, noise: float) -> Watch:
+    def told(
+        self, changes: list[FoundChange], matrix: ColumnProducts, score: ColumnScores, noise: float
+    ) -> Watch:
         """The record of the watch; the gain of a camera is what the changes leave, plus the change that it may have."""
         groups, cameras = len(self.time), len(self.cameras)
         blocks, slopes = self._by_group(matrix, score)

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import special
 
+from walop_jax.io.shapes import ColumnProducts, OfStars
 from walop_jax.likelihood.flux import FluxGroups, project_flux
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.likelihood.optics import through_series
@@ -47,8 +48,6 @@ SINGULAR = 1e-10
 ROUNDING = 1e-12
 """Share of its square that a column must have once flux, q and u are fitted: less is rounding, of either sign."""
 Residuals = Float[np.ndarray, "r k"]  # a number for each row and camera
-OfStars = Float[np.ndarray, " s"]  # one for each star
-Matrix = Float[np.ndarray, "c c"]
 
 
 _OF_ALL = ("together", "structure")  # fields that all stars have in common
@@ -210,19 +209,21 @@ def by_place(
     return place.reshape(-1), places[:, 0].astype(int)
 
 
-class Weights(NamedTuple):
+class StarWeights(NamedTuple):
     """Weights of stars: `inverse` is 1/variance of the residuals, 0 for those left out, `share` is κ."""
 
     inverse: OfStars
     share: OfStars
 
 
-Columns = Callable[[StarResiduals, slice], Float[np.ndarray, "r k c"]]  # columns of some stars and their rows
+ColumnsOfStars = Callable[
+    [StarResiduals, slice], Float[np.ndarray, "r k c"]
+]  # columns of some stars and their rows
 
 
 def normal_matrix(
-    stars: StarResiduals, residual: Residuals, columns: Columns, weights: Weights
-) -> tuple[Matrix, Float[np.ndarray, " c"]]:
+    stars: StarResiduals, residual: Residuals, columns: ColumnsOfStars, weights: StarWeights
+) -> tuple[ColumnProducts, Float[np.ndarray, " c"]]:
     """Q and g (head of this file) of columns; `residual` is that of `stars`, with or without changes."""
     matrix, score, diagonal = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
     for numbers, rows, subset in stars.blocks():
@@ -245,7 +246,7 @@ def normal_matrix(
 
 
 def eliminated(
-    matrix: Matrix, score: Float[np.ndarray, " c"], kept: int
+    matrix: ColumnProducts, score: Float[np.ndarray, " c"], kept: int
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
     """Q and g of the first `kept` columns with all others fitted (these have their priors in Q and g)."""
     if kept == len(matrix):

@@ -47,7 +47,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage, optimize, special
 
 from walop_jax.calibration.analysis_vectors import AnalysisVectors
-from walop_jax.io.shapes import OfStars
+from walop_jax.io.shapes import ColumnProducts, OfStars
 from walop_jax.likelihood.inverses import whitening
 from walop_jax.science import star_columns as alarms
 from walop_jax.science import star_residuals as residuals
@@ -64,7 +64,7 @@ from walop_jax.science.star_columns import (
     rivals_of,
 )
 from walop_jax.science.star_light import OwnLight, own_light_check
-from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, Weights, own_variance
+from walop_jax.science.star_residuals import Residuals, Scale, StarResiduals, StarWeights, own_variance
 from walop_jax.science.star_words import CatalogueCheck, DisagreeingPlace, FoundChange
 
 _MOST_CHANGES = 6
@@ -81,7 +81,6 @@ _BLIND = 1e-3  # cᵀPc over cᵀc below which a star does not see a camera
 _MOST = 8  # places
 _WIDER = 2.0  # a fitted place may be larger by this factor, and lie off by so many sizes
 
-ColumnProducts = Float[np.ndarray, "c c"]
 Sizes = Float[np.ndarray, " c"]  # of all columns
 
 
@@ -204,7 +203,7 @@ class CatalogueSearch(StarSearch):
             if not stated and rows is not None and _chance_beside(rows, noise) < self._alarm:
                 several = max(single, rows.value)
             variances = self.variance * np.where(stars.rows > 1, several, single)
-            weights = Weights(scale.kept / variances, scale.share)
+            weights = StarWeights(scale.kept / variances, scale.share)
             matrix, score = residuals.normal_matrix(stars, residual, self._columns, weights)
             return _Look(noise, rows, matrix + np.diag(self.prior), score - self.prior * sizes)
 
