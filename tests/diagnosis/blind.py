@@ -1,9 +1,9 @@
-"""A blind suite at the level of scores: thousands of hidden effects, of which a diagnosis says names, without a fit.
+"""A blind suite at the level of scores: thousands of hidden effects through the search of `diagnose`, no refits.
 
 One design (a simulated calibration set, its Jacobian, the columns of every effect and pattern) spans a space of a
 thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Gaussian noise plus an effect of known
-signal-to-noise ratio behind the projection. The first look of a diagnosis judges them: the posterior over sets of
-things (`diagnosis.selection`), which is exact here, since all columns are linear.
+signal-to-noise ratio behind the projection. They go through the search that `diagnose` runs (`diagnosis.search`), with
+its judge by linear steps in the place of the one that fits.
 Verdicts are written before the truths are opened. In some scenes the effect that is hidden is taken out of the
 catalogue: then the sentences that it is are asked for (`EFFECTS`, `in_sentences`), and no other name.
 
@@ -25,14 +25,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from linear_judge import Linear, joined
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import LIGHT, SINGLE_EXPOSURES, Measured
+from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence, Examination, common_mode, examine
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes, sentences_of
-from walop_jax.diagnosis.score import separations
-from walop_jax.diagnosis.selection import most_probable
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, sentences_of
+from walop_jax.diagnosis.score import ScoreSpace, separations
+from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.likelihood.flux import project_flux
@@ -42,10 +44,14 @@ from walop_jax.model.effects import EFFECTS, Described
 from walop_jax.model.effects.in_models import effect_context
 
 Examined = Callable[..., Examination]
+Spaces = dict[tuple[tuple[str, ...], tuple[str, ...]], ScoreSpace]
+"""Spaces of searches, by what was taken out of the catalogue and what was added."""
+
 SEPARABLE = 5.0  # σ between the truth and its nearest rival above which a name is asked for
 CONFOUNDED = 2.0  # below which a class is asked for
 PLAUSIBLE = 5.0  # prior widths that a hidden amplitude may have
 DRAWS = 3000
+KEPT = 20  # spaces of scenes alike; each takes some 40 MB
 TOGETHER = 20  # scenes
 WITHOUT_ENTRY = 6  # scenes of one kind and ratio
 
@@ -71,7 +77,7 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What is told of a scene; `said` are the sentences that were added, `classes` hold names and sentences."""
+    """What the rules say of a scene; `said` are the sentences that were added, `classes` hold names and sentences."""
 
     kind: str
     named: tuple[str, ...]
@@ -80,9 +86,7 @@ class Verdict:
     first_probe: str = ""
     amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
-    told: tuple[str, ...] = ()  # the most probable name of each thing: an effect, or a sentence
-    added: tuple[str, ...] = ()  # the most probable candidate of each
-    patterns: tuple[str, ...] = ()  # that are more probable than every name
+    added: tuple[str, ...] = ()  # probes
 
 
 # What each shape outside the catalogue is in sentences, with a blank at the end: from or to any time; none: no sentence
@@ -233,6 +237,7 @@ class Blind:
         widths = common_mode(self.space, examination.design)
         self._behind_nuisance, self._reduce = self.space.with_base([SINGLE_EXPOSURES], widths)
         self.evidence = examination
+        self._spaces: Spaces = {}
         self.free = examination.space.free
         self.visible = sorted({p.effect.name for p in self.probes if examination.table[p.name].testable})
         self._testable = {p.name for p in self.probes if examination.table[p.name].testable}
@@ -334,44 +339,62 @@ class Blind:
         )
 
     def judge(self, scene: Scene) -> Verdict:
-        """What the posterior over sets of things says of a scene."""
-        return judged(self.start(scene))
+        """What the search finds."""
+        return self.judged(scene, self.start(scene))[0]
+
+    def judged(self, scene: Scene, last: Evidence) -> tuple[Verdict, Evidence]:
+        """What the search finds from the scores of a scene, and what it leaves."""
+        named: list[str] = []
+        said: list[str] = []
+        added: list[str] = []
+        classes: list[frozenset[str]] = []
+        first: Ranked | None = None
+        judge = Cached(self._spaces, scene.removed)
+        last = search(State(last), judge).evidence
+        for trial, before in judge.adoptions:
+            item = trial.item
+            assert item is not None
+            first, name = first or item, item.effect.name
+            named.append(name)
+            added.append(item.probe.name)
+            if item.effect is Described:
+                said.append(item.probe.name)
+            told = {*trial.rivals, *trial.nameless, *before.close(item)}
+            classes.append(frozenset(told - {name, item.probe.name}))
+        missing = last.alarm or len(said) > thresholds.MOST_SENTENCES
+        kind = "unexplained" if missing else "effect_found" if named else "consistent"
+        verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said), added=tuple(added))
+        if first is None:
+            return verdict, last
+        score = first.score
+        return dataclasses.replace(
+            verdict, first_probe=first.probe.name, amplitudes=score.amplitudes, covariance=score.covariance
+        ), last
 
 
-def judged(evidence: Evidence) -> Verdict:
-    """What is told of the scores of one fit: the things of the most probable set, and whether they are all of it.
+class Cached(Linear):
+    """Steps of scenes are alike: their spaces are kept."""
 
-    As in a diagnosis, names that the data cannot distinguish from that of a thing are in its class.
-    """
-    if not evidence.alarm:
-        return Verdict("consistent", (), ())
-    posterior = most_probable(evidence)
-    named = [thing for thing in posterior.things if not thing.is_pattern]
-    first = [next(iter(thing.probabilities)) for thing in named]
-    effects = {probe.effect.name for probe in evidence.probes}
-    verdict = Verdict(
-        kind="effect_found" if named and posterior.explains else "unexplained",
-        named=tuple(name if name in effects else Described.name for name in first),
-        classes=tuple(
-            frozenset({*thing.names, *(evidence.close(item) if item else ())}) - {name}
-            for thing, name in zip(named, first, strict=True)
-            for item in [evidence.by_name.get(name)]
-        ),
-        said=tuple(name for name in first if name not in effects),
-        told=tuple(first),
-        added=tuple(getattr(thing.candidate, "name", "") for thing in named),
-        patterns=tuple(str(thing.candidate) for thing in posterior.things if thing.is_pattern),
-    )
-    if not named or isinstance(named[0].candidate, str):
-        return verdict
-    score = evidence.table[named[0].candidate.name]
-    return dataclasses.replace(
-        verdict, first_probe=score.name, amplitudes=score.amplitudes, covariance=score.covariance
-    )
+    def __init__(self, spaces: Spaces, removed: tuple[str, ...]) -> None:
+        self.spaces, self.removed = spaces, removed
+        self.adoptions: list[tuple[Trial, Evidence]] = []
+
+    def adopted(self, state: State, trial: Trial) -> State:
+        """As `Linear`, with the space of another scene where it went the same way."""
+        item = trial.item
+        assert item is not None
+        self.adoptions.append((trial, state.evidence))
+        steps = (*state.steps, trial)
+        way = self.removed, tuple(step.item.probe.name for step in steps if step.item is not None)
+        after = joined(state.evidence, item, self.spaces.get(way))
+        if len(self.spaces) > KEPT:
+            self.spaces.clear()
+        self.spaces[way] = after.space
+        return dataclasses.replace(state, evidence=after, steps=steps)
 
 
 def verdicts(blind: Blind, scenes: Sequence[Scene], processes: int = 1) -> list[Verdict]:
-    """What is told of every scene; those without the same effects are judged together, since they share a space."""
+    """What the search finds in every scene; those alike are judged together, since they share spaces."""
     blind.judge(blind.null())  # trials of the whole catalogue are drawn once
     order = sorted(range(len(scenes)), key=lambda i: (scenes[i].removed, scenes[i].kind, scenes[i].truth))
     parts = [order[i : i + TOGETHER] for i in range(0, len(order), TOGETHER)]

@@ -1,4 +1,4 @@
-"""The judge of the search that fits nothing: a name is worth what its linear step says."""
+"""The judge of the search that fits nothing, for thousands of scenes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import Choice
 from walop_jax.diagnosis.hypotheses import Ranked
+from walop_jax.diagnosis.score import ScoreSpace
 from walop_jax.diagnosis.search import State
 from walop_jax.model.effects import Described
 
@@ -39,10 +40,11 @@ class Linear:
         return dataclasses.replace(state, evidence=evidence, steps=(*state.steps, trial))
 
 
-def joined(evidence: Evidence, item: Ranked) -> Evidence:
-    """The evidence once a candidate has joined the base, by a linear step."""
+def joined(evidence: Evidence, item: Ranked, known: ScoreSpace | None = None) -> Evidence:
+    """The evidence once a candidate has joined the base, by a linear step; `known` is the space of that."""
     space, reduce = evidence.space.with_base([item.probe.name])
     scores, square = reduce(evidence.scores, evidence.square)
+    space = known or space
     effect = item.effect
     return dataclasses.replace(
         evidence,

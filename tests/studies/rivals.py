@@ -124,7 +124,7 @@ def search(bench: Bench) -> Callable[[int], Answer]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from blind import Scene, judged
+    from blind import Scene
     from generate import Layout
 
     blind = Layout(1).blind
@@ -135,13 +135,18 @@ def search(bench: Bench) -> Callable[[int], Answer]:
         along = blind._whitening.T @ evidence.design.products(evidence.columns, evidence.design.projector(r))
         seen = Scene("", (), 0.0, along, float(r @ r - along @ along), removed=(str(bench.without[scene]),))
         start = blind.start(seen)
-        verdict = judged(start)
-        told = [[name, *sorted(others)] for name, others in zip(verdict.told, verdict.classes, strict=True)]
+        verdict, left = blind.judged(seen, start)
+        names = [
+            probe if effect == "described" else effect
+            for effect, probe in zip(verdict.named, verdict.added, strict=True)
+        ]
+        told = [[name, *sorted(others)] for name, others in zip(names, verdict.classes, strict=True)]
+        patterns = [name for name, _ in left.beside_patterns[0]] if left.alarm else []
         return {
             "score": -max(min(s.log_p for s in start.table.scores if s.testable), -1e4),
             "told": told,
             "complete": verdict.kind == "effect_found",
-            "kept_back": bench.expected(r, [*verdict.added, *verdict.patterns]),
+            "kept_back": bench.expected(r, [*verdict.added, *patterns]),
         }
 
     return answer

@@ -83,7 +83,7 @@ class Scenes:
         verdict = self.blind.judge(scene)
         return {
             "kind": verdict.kind,
-            "told": list(verdict.told),
+            "added": list(verdict.added),
             "outcome": _outcome(verdict, self.truth[number]),
         }
 
@@ -91,7 +91,7 @@ class Scenes:
 def _outcome(verdict: Any, truth: dict[str, Any]) -> str:
     if verdict.kind == "consistent":
         return "right" if truth["kind"] == "null" else "not detected"
-    told = {*verdict.named, *(text for group in verdict.told for text in group.split("; "))}
+    told = {*verdict.named, *(text for group in verdict.added for text in group.split("; "))}
     classes = {text for one in verdict.classes for group in one for text in group.split("; ")}
     right = set(truth["said"])
     if truth["kind"] == "pair":
@@ -111,7 +111,7 @@ def changed(scenes: Scenes, name: str, value: float) -> tuple[int, int, int]:
         for number, before in scenes.as_they_are.items():
             now = scenes.judged(number)
             gain = WORTH[before["outcome"]] - WORTH[now["outcome"]]
-            counts[0] += any(now[key] != before[key] for key in ("kind", "told"))
+            counts[0] += any(now[key] != before[key] for key in ("kind", "added"))
             counts[1] += gain > 0
             counts[2] += gain < 0
     return counts[0], counts[1], counts[2]

@@ -16,7 +16,8 @@ Evidence     For a set M of candidates, with A their columns once the free param
 
              Every other candidate is scored in the model with M by the same formula, once the parts of G and s that
              M explains are subtracted. The posterior of M is proportional to B(M) Π π (1 − ν)/ν.
-Search       The most probable candidate is added until nothing more is missing with a probability above 1 − λ. After
+Search       Asked once the scores have raised the alarm: the first thing need only be more probable than nothing. The
+             most probable candidate is added until something more is missing with a probability below λ. After
              each addition every member is taken out in turn, and the most probable candidate beside the others takes
              its place, until nothing changes; a member that is less probable than its absence goes.
 Who it is    The *set* of a thing, given the other things, is the shortest list of names that holds it with probability
@@ -94,20 +95,9 @@ class MissingThings:
     things: tuple[Thing, ...]
     nothing_more: float
 
-    @property
-    def explains(self) -> bool:
-        """True if names explain the fit: nothing more is missing, no pattern is needed, few things are nameless.
-
-        Few are `thresholds.MOST_SENTENCES`: more descriptions than that may imitate one cause that no description is.
-        """
-        nameless = [t for t in self.things if isinstance(t.candidate, Probe) and _is_nameless(t.candidate)]
-        patterns = any(thing.is_pattern for thing in self.things)
-        few = len(nameless) <= thresholds.MOST_SENTENCES
-        return self.nothing_more > 1.0 - thresholds.CERTAIN and not patterns and few
-
 
 def most_probable(evidence: Evidence) -> MissingThings:
-    """The most probable set of things that are missing in a fit."""
+    """The most probable set of things that are missing in a fit, whose scores have raised the alarm."""
     return JointScores(evidence).posterior()
 
 
@@ -214,8 +204,10 @@ class JointScores:
         """A set to which things are added, with exchanges, until nothing more is missing; of candidates `allowed`."""
         for _ in range(thresholds.MOST_STEPS):  # an exchange may drop a member, which is added again for ever
             best, total = self._best(members, allowed)
-            nothing_more = special.expit(-(total + _odds()))
-            if nothing_more > 1.0 - thresholds.CERTAIN or len(members) == thresholds.MOST_STEPS:
+            something_more = special.expit(total + _odds())
+            # That one thing is missing the alarm has said: it need only be more probable than nothing.
+            least = thresholds.CERTAIN if members else 0.5
+            if something_more < least or len(members) == thresholds.MOST_STEPS:
                 break
             members = self._exchanged([*members, best], allowed)
         return members
