@@ -37,7 +37,7 @@ def here(run: Path, tmp_path: Path, monkeypatch) -> Path:
 @pytest.mark.parametrize(
     ("line", "option", "reason"),
     [
-        ("matrix RUN --points points.csv --y 0.2 -o out.fits", "--points", "either x and y"),
+        ("matrix RUN --points points.csv --y 0.2 -o out.fits", "--points", "--x and --y"),
         ("plot RUN -o figure.png", "NAME", "name of the figure"),
         ("trace RUN --instrument WALOP-SOUTH", "--instrument", "through one of them"),
         ("instrument --text", "NAME|FILE.toml", "name the instrument"),
