@@ -158,9 +158,10 @@ def _compared(
     if not far_off:
         # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
         return look.first_of(
-            [lambda: of_some, lambda: of_all, lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
+            [lambda: [*of_some, *of_all], lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
         )
-    whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: of_some, lambda: of_all]
+    # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
+    whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: [*of_some, *of_all]]
     if found := look.first_of(whole, look.enough):
         return found
     if descriptions and (found := _stated_otherwise(likelihood, left, values)):
