@@ -106,7 +106,11 @@ class Screen:
             if item.effects and not self.likelihood.model.effect_names:
                 rows = self.rows(*self._arranged(item))
             else:
-                rows = self.rows(Likelihood.of(*applied(item, self.calset, self.likelihood.model)))
+                calset, model = applied(item, self.calset, self.likelihood.model)
+                # Parameters of standards follow the catalogue: other values there are other values of these.
+                own = self.likelihood.model
+                moved = model.start - own.start if model.names == own.names else 0.0
+                rows = self.rows(Likelihood.of(calset, model), self.values + moved)
         except (ValueError, np.linalg.LinAlgError):
             return None
         return rows if np.isfinite(rows).all() else None
