@@ -109,7 +109,7 @@ def test_an_amplitude_that_physics_keeps_above_0_has_the_half_of_its_prior():
 
 def test_nothing_is_certain_in_noise():
     """ν = ½, λ = 0.95: of 200 draws of noise in no more than one of 100 something is missing with P above 0.95."""
-    totals = [JointScores(scene({}, seed=seed)[0])._best([])[1] for seed in range(200)]
+    totals = [JointScores(scene({}, seed=seed)[0])._best([])[2] for seed in range(200)]
     assert sum(special.expit(total) > CERTAIN for total in totals) <= 2
 
 

@@ -124,13 +124,13 @@ class JointScores:
             if probe is not None:
                 self.one_sided[self._places[number]] = probe.one_sided
             kinds[_kind(probe)].append(number)
-        self.log_prior = np.full(len(self.names), -np.inf)
+        self.log_prior = np.zeros(len(self.names))
         for members in kinds.values():
             self.log_prior[members] = -np.log(len(kinds)) - np.log(len(members))
         self._blocks = [
             (chosen, *self._block(chosen, int(size)))
             for size in np.unique(sizes)
-            if len(chosen := np.flatnonzero((sizes == size) & np.isfinite(self.log_prior)))
+            for chosen in [np.flatnonzero(sizes == size)]
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
         self.is_named = np.array([name in self.probes for name in self.names])
@@ -194,7 +194,7 @@ class JointScores:
         members = self._grown([])
         if not all(self.is_named[number] for number, _ in members):
             members = max(members, self._grown(self._grown([], self.is_named)), key=self._total)
-        nothing_more = float(special.expit(-(self._best(members)[1] + _odds())))
+        nothing_more = float(special.expit(-(self._best(members)[2] + _odds())))
         things = sorted(self._things(members), key=lambda thing: -thing.log_evidence)
         return MissingThings(tuple(things), nothing_more)
 
@@ -203,7 +203,7 @@ class JointScores:
     ) -> list[SetMember]:
         """A set to which things are added, with exchanges, until nothing more is missing; of candidates `allowed`."""
         for _ in range(thresholds.MOST_STEPS):  # an exchange may drop a member, which is added again for ever
-            best, total = self._best(members, allowed)
+            best, _, total = self._best(members, allowed)
             something_more = special.expit(total + _odds())
             # That one thing is missing the alarm has said: it need only be more probable than nothing.
             least = thresholds.CERTAIN if members else 0.5
@@ -224,22 +224,21 @@ class JointScores:
         """ln [P(any pattern) / P(any name)]; `worth` is ln B π of every candidate."""
         return _log_sum(worth[~self.is_named]) - _log_sum(worth[self.is_named])
 
-    def _probable(self, members: Sequence[SetMember]) -> tuple[AnyVector, Float[np.ndarray, "n t"]]:
-        """ln of B π of every candidate beside some members, and its evidence by scale."""
+    def _best(
+        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
+    ) -> tuple[SetMember, float, float]:
+        """The most probable candidate for a model that has `members`, ln B π of it, and ln Σ B π over all candidates.
+
+        Candidates are those `allowed`; None: all.
+        """
         found = self.beside(members)
         worth = self.over_scales(found) + self.log_prior
         worth[[number for number, _ in members]] = -np.inf
-        return worth, found
-
-    def _best(
-        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
-    ) -> tuple[SetMember, float]:
-        """The most probable candidate for a model that has `members`, and ln Σ B π, over those `allowed` (all)."""
-        worth, found = self._probable(members)
         if allowed is not None:
-            worth = np.where(allowed, worth, -np.inf)
+            worth[~allowed] = -np.inf
         number = int(np.argmax(worth))
-        return (number, float(SCALES[np.argmax(found[number])])), float(np.logaddexp.reduce(worth))
+        scale = float(SCALES[np.argmax(found[number])])
+        return (number, scale), float(worth[number]), _log_sum(worth)
 
     def _exchanged(
         self, members: list[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
@@ -249,15 +248,9 @@ class JointScores:
             before = list(members)
             for member in before:
                 others = [one for one in members if one != member]
-                worth, found = self._probable(others)
-                if allowed is not None:
-                    worth = np.where(allowed, worth, -np.inf)
-                number = int(np.argmax(worth))
-                if worth[number] + _odds() < 0.0:
-                    members = others
-                else:
-                    scale = float(SCALES[np.argmax(found[number])])
-                    members = [(number, scale) if one == member else one for one in members]
+                best, worth, _ = self._best(others, allowed)
+                replaced = [best if one == member else one for one in members]
+                members = replaced if worth + _odds() >= 0.0 else others
             if members == before or len(members) < 2:
                 break
         return members
@@ -268,9 +261,9 @@ class JointScores:
             others = [one for one in members if one != member]
             bayes = self.over_scales(self.beside(others))
             bayes[[number for number, _ in others]] = -np.inf
-            number = int(np.argmax(bayes + self.log_prior))
-            name, worth = self.names[number], bayes + self.log_prior
-            patterns = self._odds_of_patterns(worth)
+            worth = bayes + self.log_prior
+            number = int(np.argmax(worth))
+            name, patterns = self.names[number], self._odds_of_patterns(worth)
             yield Thing(self.probes.get(name, name), float(bayes[number]), *self._named(bayes), patterns)
 
     def _named(
