@@ -141,7 +141,7 @@ def search(bench: Bench) -> Callable[[int], Answer]:
             for effect, probe in zip(verdict.named, verdict.added, strict=True)
         ]
         told = [[name, *sorted(others)] for name, others in zip(names, verdict.classes, strict=True)]
-        patterns = [name for name, _ in left.beside_patterns[0]] if left.alarm else []
+        patterns = [name for name, _ in left.patterns_needed] if left.alarm else []
         return {
             "score": -max(min(s.log_p for s in start.table.scores if s.testable), -1e4),
             "told": told,

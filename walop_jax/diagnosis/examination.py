@@ -164,9 +164,8 @@ class Evidence:
         return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
 
     @cached_property
-    def beside_patterns(self) -> tuple[list[tuple[str, float]], ScoreTable]:
-        """Patterns that together leave nothing significant, with corrected p, the most probable first, one by one; and
-        the scores of everything with those as nuisances."""
+    def patterns_needed(self) -> list[tuple[str, float]]:
+        """Patterns that together leave nothing significant, with corrected p: the most probable first, one by one."""
         space, scores, square = self.space, self.scores, self.square
         names, table, needed = list(self.patterns), self.table, []
         while len(needed) < thresholds.MOST_PATTERNS:
@@ -183,7 +182,7 @@ class Evidence:
             space, reduce = space.with_base([best.name])
             scores, square = reduce(scores, square)
             table = space.table_after(self.table, scores)
-        return needed, table
+        return needed
 
     # ------------------------------------------------------------------------------- indistinguishable candidates
 

@@ -155,7 +155,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     result, measured = evidence.result, evidence.design.measured
     remainder = _unexplained(evidence)
     blocks = dict.fromkeys(
-        block for name, _ in evidence.beside_patterns[0] if (block := evidence.candidates[name].block)
+        block for name, _ in evidence.patterns_needed if (block := evidence.candidates[name].block)
     )
     if len(result.calset.exposures) > limits.FREE_EXPOSURES:
         for block in ("exposures", "exposure_gains"):
@@ -182,7 +182,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
 def _unexplained(evidence: Examination) -> Unexplained:
     """Unidentified remainder of an examination: its patterns, and the location of the residuals."""
     cameras = evidence.result.model.template.cameras.names
-    patterns = tuple((pattern_in_words(name, cameras), p) for name, p in evidence.beside_patterns[0])
+    patterns = tuple((pattern_in_words(name, cameras), p) for name, p in evidence.patterns_needed)
     if not evidence.alarm:
         factor = np.sqrt(evidence.chi2 / evidence.dof)
         size = with_error(factor, factor / np.sqrt(2.0 * evidence.dof))
