@@ -21,7 +21,7 @@ from walop_jax.fit.verdict import Doubt, Quality, Verdict
 from walop_jax.io.display import Display, Drawn
 from walop_jax.io.plain_tables import astropy_table
 from walop_jax.io.shapes import ResidualCube
-from walop_jax.io.text import per_cent, plain, probability, some, value_and_error
+from walop_jax.io.text import per_cent, plain, probability, some, value_and_error, with_error
 from walop_jax.model import legendre
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import Change
@@ -213,29 +213,23 @@ class Step(FitComparison):
     def in_words(self) -> str:
         """What is missing, where, how large it is and how probable its name.
 
-        For example "a dark spot in front of one camera, O2: depth 0.0060 ± 0.0005 at x 0.11 ± 0.01 deg (blemish,
+        For example "a dark spot in front of one camera, O2: depth 0.0060 ± 0.0005, x 0.11 ± 0.01 deg (blemish,
         probability 0.97)". What has no name is told by its descriptions, or by the change of the instrument.
         """
+        likely = "above 0.99" if self.probability > 0.99 else f"{self.probability:.2g}"
+        known = [f"probability {likely}"] if math.isfinite(self.probability) else []
         if self.descriptions:
             words = " and ".join(_sentence(*entry)["words"] for entry in self.descriptions)
-            return f"{words}{self._likely(' (', ')')}"
+            return f"{words} ({known[0]})" if known else words
         if change := self.choices.get("change", ""):
             return f"{change} ({self.effect})"
-        numbers = [
-            f"{name} {' ± '.join(value_and_error(value, sigma))} {unit}".rstrip()
+        sizes = {
+            name: f"{with_error(value, sigma)} {unit}".rstrip()
             for name, (value, sigma, unit) in self.parameters.items()
-        ]
-        if len(numbers) == 1:
-            numbers = [numbers[0].split(" ", 1)[1]]
-        size = f": {', '.join(numbers)}" if numbers else ""
-        return f"{self.about or self.effect}{size} ({self.effect}{self._likely(', ')})"
-
-    def _likely(self, before: str, after: str = "") -> str:
-        """Its probability in words; empty where that is not known."""
-        if not math.isfinite(self.probability):
-            return ""
-        value = "above 0.99" if self.probability > 0.99 else f"{self.probability:.2g}"
-        return f"{before}probability {value}{after}"
+        }
+        told = sizes.values() if len(sizes) == 1 else (f"{name} {size}" for name, size in sizes.items())
+        what = f"{self.about or self.effect}: {', '.join(told)}" if sizes else self.about or self.effect
+        return f"{what} ({', '.join([self.effect, *known])})"
 
 
 @dataclasses.dataclass(frozen=True)
