@@ -153,15 +153,14 @@ def _compared(
         return look.explaining(of_some, look.enough)
     tell("comparing discrete causes: plates, beams and cables, signs, zeros and units of the data")
     of_all = list(readings(few, model))
+    # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
+    of_data = [*of_some, *of_all]
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
     sure, far_off = thresholds.READING_SURE, left >= FAR_OFF
     if not far_off:
         # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
-        return look.first_of(
-            [lambda: [*of_some, *of_all], lambda: look.screen.in_parts(of_all)], min(look.enough, sure)
-        )
-    # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
-    whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: [*of_some, *of_all]]
+        return look.first_of([lambda: of_data, lambda: look.screen.in_parts(of_all)], min(look.enough, sure))
+    whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: of_data]
     if found := look.first_of(whole, look.enough):
         return found
     if descriptions and (found := _stated_otherwise(likelihood, left, values)):
@@ -169,7 +168,7 @@ def _compared(
     if found := look.first_of([lambda: look.screen.in_parts(of_all), look.screen.steps], sure):
         return found
     tell("comparing two mistakes of the data at once")
-    if found := look.pairs([*of_some, *of_all]):
+    if found := look.pairs(of_data):
         return found
     # Each of these may cost a program of its own.
     described = [
@@ -185,7 +184,7 @@ def _compared(
     if found := look.first_of([*further, lambda: instruments(few)], look.enough):
         return found
     tell("comparing two discrete causes at once")
-    if found := look.pairs([*of_instrument, *of_some, *of_all, *described]):
+    if found := look.pairs([*of_instrument, *of_data, *described]):
         return found
     near = sorted(look.near, key=_left)
     return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
