@@ -85,7 +85,8 @@ def _groups(
     """The groups of sentences that were added, each with its name; an ungrouped sentence is a group of its own."""
     ungrouped = [text for text in effect.sentences if text not in given]
     for name in groups:
-        group = tuple(text for text in ungrouped if text in name.split("; "))
+        said = name.split("; ")
+        group = tuple(text for text in ungrouped if text in said or Sentence.parsed(text).candidate in said)
         ungrouped = [text for text in ungrouped if text not in group]
         if group:
             yield name, group

@@ -23,14 +23,17 @@ from scipy import special
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import GAIN, SINGLE_EXPOSURES, Design, number_of_columns, strata
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, all_candidates
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, SmoothField, all_candidates
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, log_bayes, separations
+from walop_jax.diagnosis.smooth_fields import SmoothFields
 from walop_jax.diagnosis.synonyms import synonyms
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import limits
+from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import Described, EffectKind
+from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import Instrument
 
 
@@ -102,6 +105,15 @@ class Evidence:
     dof: int
     scale: float = 1.0
     also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def smooth(self) -> SmoothFields | None:
+        """Smooth fields that may be missing; None where columns were not kept."""
+        return None
+
+    def products_with(self, name: str) -> AnyMatrix:
+        """CᵀC behind the free parameters, of all candidates C with one of them."""
+        return self.space.gram[:, self.space.places()[name]]
 
     @property
     def asked(self) -> tuple[Probe, ...]:
@@ -257,13 +269,54 @@ class Examination(Evidence):
     """The evidence of one fit, and its origin.
 
     `candidates` are those of `space` by name, in its order, with their columns ahead of any projection; `bare` is their
-    space ahead of the nuisance of single exposures.
+    space ahead of the nuisance of single exposures. `fields` are the changes that may vary smoothly over the field.
     """
 
     result: FitResult
     design: Design
     candidates: Mapping[str, Candidate]
     bare: ScoreSpace
+    fields: Sequence[SmoothField] = ()
+
+    @cached_property
+    def smooth(self) -> SmoothFields | None:
+        """Smooth fields with their scores, made when they are first asked for; None of a set with too few points."""
+        columns = self.design.columns
+        fields = [f for f in self.fields if all(columns.has([(1.0, change)]) for change in f.changes)]
+        if not fields:
+            return None
+        context = effect_context(self.result.model.template, self.result.calset.exposures)
+        basis = np.hstack([self.design.projector.basis, self._of_single_exposures()])
+        return SmoothFields(self.design, fields, context, basis)
+
+    def _of_single_exposures(self) -> AnyMatrix:
+        """Columns Z of which Z Zᵀ is what the disturbances of single exposures take up, behind the free parameters."""
+        if SINGLE_EXPOSURES not in self.candidates:
+            return np.zeros((len(self.design.residual), 0))
+        at, alive = self.bare.places()[SINGLE_EXPOSURES], self.bare.alive
+        place = np.arange(at.start, at.stop)[alive[at]]
+        widths = common_mode(self.bare, self.design)[alive[at]]
+        w = whitening(self.bare.gram[np.ix_(place, place)] + np.diag(widths**-2))
+        columns = self.design.stacked([self.candidates[SINGLE_EXPOSURES].columns[:, alive[at]]])
+        return self.design.projector(columns) @ w
+
+    def candidate(self, name: str) -> Candidate:
+        """A candidate or a smooth field, with its columns."""
+        if name in self.candidates or self.smooth is None:
+            return self.candidates[name]
+        return self.smooth.candidate(name)
+
+    def products_with(self, name: str) -> AnyMatrix:
+        """CᵀC behind the free parameters, of all candidates and then all smooth fields C with a candidate by name."""
+        smooth = self.smooth
+        if smooth is None:
+            return super().products_with(name)
+        if name in self.candidates:
+            of_candidates = super().products_with(name)
+            columns = self.design.stacked([self.candidates[name].columns])[: self.design.rows]
+            return np.concatenate([of_candidates, smooth.products(smooth.behind(columns))])
+        rows = smooth.behind(smooth.columns(name))
+        return np.concatenate([self.design.products(self.columns, rows), smooth.products(rows)])
 
     @property
     def columns(self) -> list[AnyMatrix]:
@@ -372,6 +425,7 @@ def examine(
         design=design,
         candidates=candidates,
         bare=bare,
+        fields=hypotheses.smooth,
         also=known,
     )
 

@@ -26,11 +26,19 @@ from jaxtyping import Bool, Float
 
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.hypotheses import FEWEST_POINTS, Hypotheses, Probe, applicable, probes, sentences_of
+from walop_jax.diagnosis.hypotheses import (
+    FEWEST_POINTS,
+    Hypotheses,
+    Probe,
+    SmoothField,
+    applicable,
+    probes,
+    sentences_of,
+)
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.cameras import POWERS
-from walop_jax.model.effects.change import BAND, KINDS, OPPOSITE, SKY
+from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY
 from walop_jax.model.effects.change import Change as Sentence
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.in_models import effect_context
@@ -65,7 +73,8 @@ def hypotheses(
     all_probes = sentences(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
     alone, partial = beside_names(all_probes, effects, context, instrument)
-    return Hypotheses(tuple(probes(effects, context)), alone, partial, effects, all_probes)
+    smooth = smooth_fields(instrument, exposures, points)
+    return Hypotheses(tuple(probes(effects, context)), alone, partial, effects, all_probes, smooth)
 
 
 # ------------------------------------------------------------------------------------- names that are sentences
@@ -142,6 +151,39 @@ def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Bas
 
 
 def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[Base]:
+    """All groups of sentences: the changes of each subject, with each pattern over the field and each law."""
+    for bases, patterns, group, order in _with_laws(instrument, exposures, points):
+        for pattern, base in itertools.product(patterns, bases):
+            pairs = [
+                tuple(filter(None, pair[::order])) for pair in itertools.product(group, PATTERNS[pattern])
+            ]
+            yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
+
+
+def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> tuple[SmoothField, ...]:
+    """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with."""
+    found: dict[str, SmoothField] = {}
+    for bases, patterns, group, order in _with_laws(
+        dataclasses.replace(instrument, effects=()), exposures, points
+    ):
+        if not any(PATTERNS[pattern] != ("",) for pattern in patterns if pattern != "rings"):
+            continue
+        for base in bases:
+            changes = [sentence.times(*filter(None, (law,))) for sentence in base for law in group]
+            # All amplitudes of one kind come together, as `Described` has them.
+            changes.sort(key=lambda change: list(AMPLITUDES).index(change.parameter))
+            field = SmoothField(tuple(changes), pattern_first=order < 0)
+            found.setdefault(field.name, field)
+    return tuple(found.values())
+
+
+def _with_laws(
+    instrument: Instrument, exposures: Exposures, points: int
+) -> Iterator[tuple[list[Base], list[str], tuple[str, ...], int]]:
+    """Changes that are tried together, the patterns over the field of each, a law of the exposures for each.
+
+    The last number is −1 where a pattern stands ahead of the law in a text, 1 where it stands behind it.
+    """
     over_field, everything = points >= FEWEST_POINTS, np.ones(len(exposures), bool)
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
         shown = Dependences(exposures, over_field, prefixes, everything if inside is None else inside)
@@ -150,12 +192,10 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
             -1 if first.relation in ("behind", "ahead of") else 1
         )  # between elements the pattern comes first
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
-            patterns = [PATTERNS[name] for name in over if over_field or name == "even"]
-            factors = itertools.chain(*map(shown.of, along))
-            alternatives = itertools.chain(*(bases.get(name, ()) for name in among))
-            for group, pattern, base in itertools.product(factors, patterns, alternatives):
-                pairs = [tuple(filter(None, pair[::order])) for pair in itertools.product(group, pattern)]
-                yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
+            patterns = [name for name in over if over_field or name == "even"]
+            alternatives = list(itertools.chain(*(bases.get(name, ()) for name in among)))
+            for group in itertools.chain(*map(shown.of, along)):
+                yield alternatives, patterns, group, order
 
 
 def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:

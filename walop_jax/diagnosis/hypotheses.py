@@ -21,9 +21,12 @@ from walop_jax.diagnosis.score import Candidate, Score
 from walop_jax.io.shapes import AnyVector
 from walop_jax.io.text import rounded
 from walop_jax.likelihood.columns import Columns, SumOfSentences, own_columns
+from walop_jax.model import legendre
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
+from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.factors import SMOOTH_DEGREE
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.ray import CONDITIONS
@@ -81,11 +84,40 @@ class Ranked:
         return self.probe.name if self.effect is Described else self.effect.name
 
 
+class SmoothField(NamedTuple):
+    """Changes at a place, under a law, that vary over the field in any smooth way: one candidate with many amplitudes.
+
+    Each of the `changes` has no pattern over the field; in the candidate it is multiplied by every term of a smooth
+    field (factors `field I J`). Example: "retardance q behind collimator * smooth * hours; retardance u behind …".
+    `pattern_first` says whether its pattern stands ahead of the law in a text.
+    """
+
+    changes: tuple[Change, ...]
+    pattern_first: bool
+
+    @property
+    def name(self) -> str:
+        """The names of its changes, with `smooth` as the pattern over the field."""
+        return "; ".join(dict.fromkeys(self._term(change, 0, 0).candidate for change in self.changes))
+
+    def _term(self, change: Change, i: int, j: int) -> Change:
+        pattern = (f"field {i} {j}",)
+        factors = (*pattern, *change.factors) if self.pattern_first else (*change.factors, *pattern)
+        return dataclasses.replace(change, factors=factors)
+
+    def probe(self, context: Context) -> Probe:
+        """The candidate, its amplitudes change by change, and term by term of each."""
+        terms = legendre.terms(SMOOTH_DEGREE)
+        texts = tuple(self._term(change, i, j).text for change in self.changes for i, j in terms)
+        return Probe(self.name, Described, (Described.of(context, sentences=texts),), context)
+
+
 class Hypotheses(NamedTuple):
     """All possible omissions of a model: probes of effects with a name, and sentences.
 
     `sentences` are those that no effect holds, `parts` those that are a part of effects. `effects` are those that fit
-    the instrument, `every` all sentences, those that are an effect by another name as well.
+    the instrument, `every` all sentences, those that are an effect by another name as well. `smooth` are changes that
+    may vary over the field in any smooth way, which no list of simple patterns holds.
     """
 
     names: Sequence[Probe] = ()
@@ -93,6 +125,7 @@ class Hypotheses(NamedTuple):
     parts: Sequence[Probe] = ()
     effects: tuple[EffectKind, ...] = ()
     every: Sequence[Probe] = ()
+    smooth: Sequence[SmoothField] = ()
 
     def beside(self, effects: Collection[str]) -> tuple[Probe, ...]:
         """All candidates beside the effects that a model has."""

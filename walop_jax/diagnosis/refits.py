@@ -79,12 +79,18 @@ class Refits:
         if item.effect is Described:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
-            description = self._with_best_times(evidence, shortest(item))
+            description = self._description(evidence, item)
             refitted = try_effect(evidence.result, description, len(evidence.sentences))
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, shapes)
         return dataclasses.replace(refitted, item=item, expected=trial.expected)
+
+    def _description(self, evidence: Examination, item: Ranked) -> Described:
+        """The description to be fitted: all terms of a smooth field, of other groups those that are worth their length."""
+        if evidence.smooth is not None and item.name in evidence.smooth.names:
+            return Described.combine(item.probe.group, item.score.amplitudes)
+        return self._with_best_times(evidence, shortest(item))
 
     def _with_best_times(self, evidence: Examination, description: Described) -> Described:
         """A description, its start or stop (if it has one) at the time that explains most by linear steps."""
@@ -105,7 +111,7 @@ class Refits:
         Effects of the catalogue are not asked: their names support them.
         """
         single = any("exposure" in text for text in sentences_of(item.probe))
-        column = [evidence.candidates[item.probe.name]]
+        column = [evidence.candidate(item.probe.name)]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
     def others(self, state: State) -> tuple[list[Trial], Mapping[str, Choice]]:

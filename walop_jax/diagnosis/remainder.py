@@ -57,7 +57,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
         return state, None
     text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
-    columns = [first.evidence.candidates[name] for name in added]
+    columns = [first.evidence.candidate(name) for name in added]
     if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
         return state, remainder
     state = _without(first, state, [Described.name], judge)

@@ -45,8 +45,8 @@ from scipy import special
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
-from walop_jax.diagnosis.score import SCALES, log_bayes_by_scale
-from walop_jax.io.shapes import AnyVector
+from walop_jax.diagnosis.score import SCALES
+from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.model.effects import Described
 
 MOST_EXCHANGES = 10  # rounds after one addition; only candidates that are equal would change places for ever
@@ -109,60 +109,83 @@ class JointScores:
     """
 
     def __init__(self, evidence: Evidence) -> None:
-        space = evidence.space
-        self.names = space.names
+        space, smooth, self._evidence = evidence.space, evidence.smooth, evidence
         self.probes: dict[str, Probe] = {probe.name: probe for probe in evidence.asked}
-        self._gram, self._noise = space.gram, evidence.table.noise_scale
+        self._noise = evidence.table.noise_scale
+        names, sizes, scores = list(space.names), np.array(space.sizes), np.asarray(evidence.scores)
         self.widths = np.where(space.alive, space.widths, 0.0)
-        self.scores = np.asarray(evidence.scores) * self.widths / self._noise**2
-        sizes = np.array(space.sizes)
-        self._places = list(space.places().values())
+        if smooth is not None:
+            # A smooth field has thousands of names of its own: the sentences are made when one is fitted.
+            self.probes |= {name: Probe(name, Described, ()) for name in smooth.names}
+            names, sizes = [*names, *smooth.names], np.concatenate([sizes, smooth.sizes])
+            self.widths = np.concatenate([self.widths, smooth.widths])
+            scores = np.concatenate([scores, smooth.scores])
+        self.names = tuple(names)
+        self.scores = scores * self.widths / self._noise**2
+        stop = np.cumsum(sizes).tolist()
+        self._places = [slice(int(b - k), b) for b, k in zip(stop, sizes, strict=True)]
+        grams = [space.gram[at, at] for at in space.places().values()] + (
+            [] if smooth is None else smooth.grams
+        )
         self.one_sided = np.zeros(len(self.widths), bool)
         kinds = collections.defaultdict[str, list[int]](list)
         for number, name in enumerate(self.names):
             probe = self.probes.get(name)
-            if probe is not None:
+            if probe is not None and probe.group:
                 self.one_sided[self._places[number]] = probe.one_sided
             kinds[_kind(probe)].append(number)
         self.log_prior = np.zeros(len(self.names))
         for members in kinds.values():
             self.log_prior[members] = -np.log(len(kinds)) - np.log(len(members))
         self._blocks = [
-            (chosen, *self._block(chosen, int(size)))
+            (chosen, *self._block(chosen, int(size), grams))
             for size in np.unique(sizes)
             for chosen in [np.flatnonzero(sizes == size)]
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
         self.is_named = np.array([name in self.probes for name in self.names])
+        self._products: dict[int, AnyMatrix] = {}
 
     def _block(
-        self, chosen: Int[np.ndarray, " n"], size: int
+        self, chosen: Int[np.ndarray, " n"], size: int, grams: Sequence[AnyMatrix]
     ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n k k"]]:
         """Positions of the amplitudes of candidates of one size, and products of the columns of each."""
         at = np.array([self._places[number].start for number in chosen])[:, None] + np.arange(size)
-        gram = np.stack([self._gram[place, place] for place in map(self._places.__getitem__, chosen)])
+        gram = np.stack([grams[number] for number in chosen])
         return at, gram * self.widths[at][:, :, None] * self.widths[at][:, None, :] / self._noise**2
+
+    def _products_with(self, number: int) -> Float[np.ndarray, "a k"]:
+        """Products of the columns of all candidates with those of one."""
+        if number not in self._products:
+            products = self._evidence.products_with(self.names[number])
+            own = self.widths[self._places[number]]
+            self._products[number] = products * (self.widths[:, None] * own / self._noise**2)
+        return self._products[number]
 
     # --------------------------------------------------------------------------------------------- evidence
 
     def beside(self, members: Sequence[SetMember]) -> Float[np.ndarray, "n t"]:
-        """ln B of every candidate at each scale of its prior, in a model with `members`; −∞ where it has none."""
+        """ln B of every candidate at each scale of its prior, in a model with `members`; −∞ where it has none.
+
+        With the products G and scores s of a candidate in prior widths, beside the members, and the scale t
+
+            ln B = ½ t² sᵀ (1 + t² G)⁻¹ s − ½ ln det(1 + t² G)
+        """
         along, taken = self._taken_up(members)
         scores = self.scores - along @ taken
         found = np.full((len(self.names), len(SCALES)), -np.inf)
         for chosen, at, gram in self._blocks:
-            left = gram - np.einsum("nim,njm->nij", along[at], along[at])
-            if at.shape[1] == 1:
-                value, vector = left[:, :, 0], np.ones_like(left)
-            else:
-                value, vector = np.linalg.eigh(left)
-            value = np.clip(value, 0.0, None)
-            turned = np.einsum("nij,ni->nj", vector, scores[at])
-            scales = SCALES[: 1 if at.shape[1] == 1 else None]
-            found[chosen, : len(scales)] = log_bayes_by_scale(value, turned, scales)
-            if (one_sided := self.one_sided[at]).any():
-                spread = scales[:, None] ** 2 / (1.0 + scales[:, None] ** 2 * value[:, None])
-                found[chosen, : len(scales)] += _on_its_side(one_sided, vector, spread, turned)
+            size = at.shape[1]
+            left, s = gram - along[at] @ along[at].swapaxes(1, 2), scores[at]
+            for column, t in enumerate(SCALES[: 1 if size == 1 else None]):
+                root = np.linalg.cholesky(np.eye(size) + t**2 * left)
+                pull = np.linalg.solve(root, t * s[..., None])[..., 0]
+                log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+                found[chosen, column] = 0.5 * np.sum(pull**2, axis=1) - log_root
+                if (one_sided := self.one_sided[at]).any():
+                    inverse = np.linalg.inv(root)
+                    covariance = t**2 * inverse.swapaxes(1, 2) @ inverse
+                    found[chosen, column] += _on_its_side(one_sided, covariance, s)
         return found
 
     def _taken_up(self, members: Sequence[SetMember]) -> tuple[Float[np.ndarray, "a m"], AnyVector]:
@@ -174,7 +197,7 @@ class JointScores:
         scale = np.concatenate(
             [np.full(p.stop - p.start, t) for p, (_, t) in zip(places, members, strict=True)]
         )
-        products = self._gram[:, at] * (self.widths[:, None] * scale * self.widths[at] / self._noise**2)
+        products = np.concatenate([self._products_with(number) for number, _ in members], axis=1) * scale
         root = np.linalg.cholesky(products[at] * scale[:, None] + np.eye(len(at)))
         return np.linalg.solve(root, products.T).T, np.linalg.solve(root, scale * self.scores[at])
 
@@ -294,19 +317,17 @@ def _odds() -> float:
 
 def _on_its_side(
     one_sided: Bool[np.ndarray, "n k"],
-    vector: Float[np.ndarray, "n k k"],
-    spread: Float[np.ndarray, "n t k"],
-    turned: Float[np.ndarray, "n k"],
-) -> Float[np.ndarray, "n t"]:
+    covariance: Float[np.ndarray, "n k k"],
+    scores: Float[np.ndarray, "n k"],
+) -> AnyVector:
     """ln of the probability that one-sided amplitudes are above 0, by data and prior against the prior alone.
 
-    Exact for one amplitude; several are independent here. `spread` are the variances of the amplitudes along the
-    columns of `vector`, `turned` the scores there.
+    Exact for one amplitude; several are independent here. `covariance` is that of the amplitudes by data and prior.
     """
-    mean = -np.einsum("nij,ntj,nj->nti", vector, spread, turned)
-    sigma = np.sqrt(np.einsum("nij,ntj->nti", vector**2, spread))
+    mean = -np.einsum("nij,nj->ni", covariance, scores)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     above = np.log(2.0) + special.log_ndtr(mean / sigma)
-    return np.sum(np.where(one_sided[:, None], above, 0.0), axis=2)
+    return np.sum(np.where(one_sided, above, 0.0), axis=1)
 
 
 def _log_sum(logs: Iterable[float]) -> float:

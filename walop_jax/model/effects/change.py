@@ -132,6 +132,8 @@ class ChangeKind:
     slots: SlotTerms = dataclasses.field(kw_only=True)
 
 
+SMOOTH = "smooth"
+"""Word for all terms of a smooth field (factors `field I J`) together."""
 OF_CAMERAS = ("gain", "reported gain", "light", "afterglow")
 """Kinds of changes of counts."""
 KINDS: dict[str, ChangeKind] = {}
@@ -169,6 +171,16 @@ class Change:
     def label(self) -> str:
         """The text of the change without blanks, for the name of a parameter."""
         return self.text.replace(" ", "_")
+
+    @property
+    def candidate(self) -> str:
+        """The text, in which the terms of a smooth field have one name: `gain of O1 * hours * smooth`.
+
+        A diagnosis has all terms of a smooth field as one candidate.
+        """
+        smooth = [item.text for item in self.grows_with if item.form == "field"]
+        texts = (SMOOTH if item in smooth else item for item in self.text.split(" * "))
+        return " * ".join(texts) if smooth else self.text
 
     @property
     def parameter(self) -> str:

@@ -66,6 +66,12 @@ def _ring(at: Any, units: Units, degree: str) -> Any:
     return legendre.polynomial(int(degree), 2.0 * square / LARGEST_SQUARE - 1.0)
 
 
+def _smooth(at: Any, units: Units, i: str, j: str) -> Any:
+    """The term P_i(X/h) P_j(Y/h) of a smooth field, times its standard deviation beforehand (`smooth_deviations`)."""
+    of_x, of_y = (legendre.polynomial(int(degree), t / units.field) for degree, t in ((i, at.x), (j, at.y)))
+    return smooth_deviations()[int(i)] * smooth_deviations()[int(j)] * of_x * of_y
+
+
 def _wave(at: Any, _: Units, wave: str, order: str, prefix: str) -> Any:
     """Cosine or sine of a multiple of the angle of a moving element, by the prefix of its columns."""
     angle = at.angle(prefix)
@@ -84,10 +90,36 @@ def _side(at: Any, _: Units, prefix: str) -> Any:
     return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
 
 
+SMOOTH_DEGREE = 6
+"""Largest total degree of the terms of a smooth field."""
+SMOOTH_LENGTH = 0.5
+"""Length over which a smooth field changes, in units of the scale of the field."""
+
+
+@functools.cache
+def smooth_deviations() -> tuple[float, ...]:
+    """Standard deviations of the coefficients of P_0 … P_6 along one axis of a Gaussian process of variance 1.
+
+    Equation    s_i² = ((2i + 1)/2)² ∫∫ P_i(t) P_i(u) exp(−(t − u)²/2ℓ²) dt du, t and u from −1 to 1
+    Symbols     ℓ `SMOOTH_LENGTH`; the process over the field has the kernel exp(−|Δ|²/2ℓ²), so that the term i, j has
+                the standard deviation s_i s_j
+    Limits      correlations of coefficients whose degrees differ by 2, 4 … are left out
+    Source      Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, ch. 4.3 (expansion of a kernel)
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    kernel = np.exp(-0.5 * ((nodes[:, None] - nodes) / SMOOTH_LENGTH) ** 2)
+    values = np.polynomial.legendre.legvander(nodes, SMOOTH_DEGREE) * weights[:, None]
+    variances = np.einsum("ti,tu,ui->i", values, kernel, values) * (np.arange(SMOOTH_DEGREE + 1) + 0.5) ** 2
+    return tuple(np.sqrt(variances).tolist())
+
+
 FORMS: Mapping[str, tuple[str, str, str, str, Callable[..., Any]]] = {
     "ring N": (
         r"ring (\d+)", FIELD, "in rings over the field (Legendre polynomial {0} of the radius squared)", MORE_POINTS,
         _ring,
+    ),
+    "field I J": (
+        r"field (\d+) (\d+)", FIELD, "in a smooth field (term {0}, {1})", MORE_POINTS, _smooth,
     ),
     "cos N PREFIX, sin N PREFIX": (
         r"(cos|sin) (\d+) (\S+)", EXPOSURE, "as the {0} of {1} × the angle of {2}",

@@ -1,0 +1,183 @@
+"""Scores of changes that vary over the field in any smooth way: one candidate for each place and law.
+
+A smooth field f(X, Y) is a Gaussian process, expanded in Legendre polynomials to the sixth degree, which become less
+probable with their degree (`model.effects.factors.smooth_deviations`). Its columns are not written out: the column of a
+term is that of the same change without a pattern, times the values of the term at the field points.
+
+Equation    C_{cf} = c F_f,   C_{cf}ᵀ V = Σ_p F_pf (c_pᵀ V_p)
+            and behind the free parameters and the disturbances of single exposures G = CᵀC − (CᵀB)(CᵀB)ᵀ, s = CᵀPr
+Symbols     c column of a change without a pattern over the field, c_p its rows of the field point p; F_pf value of the term
+            f there; V any columns of rows; B = [Q, Z] orthonormal basis Q of the derivatives by the free parameters,
+            Z Zᵀ the part that single exposures take up (`examination.common_mode`); P = 1 − BBᵀ; r residuals
+Limits      Ghosts of the model, 10⁻³ of the light, carry the pattern of the field point at which they are seen, and not
+            that of the opposite one, from which they come. A fit has them exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.hypotheses import Probe, Ranked, SmoothField
+from walop_jax.diagnosis.score import ABSORBED, FAINTEST, Candidate, ScoreSpace, ScoreTable
+from walop_jax.io.shapes import AnyMatrix, AnyVector
+from walop_jax.model import legendre
+from walop_jax.model.effects import Context
+from walop_jax.model.effects.factors import SMOOTH_DEGREE, smooth_deviations
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SmoothFields:
+    """The smooth fields that a fit may lack, with their products behind the free parameters.
+
+    `basis` are the columns of B (module docstring), by rows of data and priors.
+    """
+
+    design: Design
+    fields: Sequence[SmoothField]
+    context: Context
+    basis: AnyMatrix
+
+    def behind(self, columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
+        """What neither the free parameters nor the disturbances of single exposures take up of columns, by rows."""
+        basis = self.basis[: len(columns)]
+        return columns - basis @ (basis.T @ columns)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the candidates."""
+        return tuple(field.name for field in self.fields)
+
+    @cached_property
+    def _number(self) -> dict[str, int]:
+        return {name: number for number, name in enumerate(self.names)}
+
+    @cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of amplitudes of each."""
+        return tuple(len(field.changes) * self._terms.shape[1] for field in self.fields)
+
+    @cached_property
+    def widths(self) -> AnyVector:
+        """Prior widths of all amplitudes, one candidate after the other; those that data cannot show have 0."""
+        count, largest = self._terms.shape[1], self.context.largest
+        widths = np.concatenate(
+            [np.repeat([c.width(largest) for c in f.changes], count) for f in self.fields]
+        )
+        before, after = (
+            np.concatenate([np.diag(square) for square in squares]) for squares in (self._before, self.grams)
+        )
+        shown = (after > ABSORBED * before) & (np.sqrt(np.clip(after, 0.0, None)) * widths > FAINTEST)
+        return np.where(shown, widths, 0.0)
+
+    @cached_property
+    def scores(self) -> AnyVector:
+        """CᵀPr of all amplitudes."""
+        return self.products(self.behind(self.design.residual[:, None]))[:, 0]
+
+    @cached_property
+    def grams(self) -> list[AnyMatrix]:
+        """The Gram matrix of each candidate, behind the free parameters."""
+        along, grams, stop = self.products(self.basis), list[AnyMatrix](), 0
+        for square in self._before:
+            own = along[stop : (stop := stop + len(square))]
+            grams.append(square - own @ own.T)
+        return grams
+
+    def products(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "a n"]:
+        """CᵀV of all amplitudes with any columns V, of which only the rows of data count."""
+        sums = np.zeros((self._terms.shape[1], len(self._place), rows.shape[1]))
+        for point, at in enumerate(self._rows_of_points):
+            sums += self._terms[point][:, None, None] * (self._columns[at].T @ rows[at])
+        return np.concatenate(
+            [sums[:, places].swapaxes(0, 1).reshape(-1, rows.shape[1]) for places in self._of]
+        )
+
+    def columns(self, name: str) -> AnyMatrix:
+        """The columns of one candidate, rows of data in units of the noise."""
+        of_changes = self._columns[:, self._of[self._number[name]]].astype(float)
+        terms = self._terms[self.design.point]
+        return (of_changes[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
+
+    def candidate(self, name: str) -> Candidate:
+        """One of them with the columns that a fit would have: exact derivatives at the fit."""
+        probe = self.probe(name)
+        (member,) = probe.group
+        columns = self.design.columns.of(member.first_order(self.design.fit.model.template))
+        return Candidate(name, columns, probe.widths)
+
+    def probe(self, name: str) -> Probe:
+        """One of them as a description of the grammar."""
+        return self.fields[self._number[name]].probe(self.context)
+
+    def ranked(self, name: str, noise: float) -> Ranked:
+        """One of them with its score, as a candidate that can be fitted; `noise` is the scatter of the residuals."""
+        number = self._number[name]
+        stop = int(np.sum(self.sizes[: number + 1]))
+        at = slice(stop - self.sizes[number], stop)
+        probe, gram = self.probe(name), self.grams[number]
+        free, before = self.design.projector.free, np.diag(self._before[number])
+        space = ScoreSpace((name,), (self.sizes[number],), probe.widths, before, gram, free)
+        score = space.table_after(ScoreTable((), noise, 1.0, 1.0), self.scores[at])[name]
+        # Of many amplitudes, those are meant that the data and the prior together give.
+        inverse = np.linalg.inv(gram / noise**2 + np.diag(probe.widths**-2.0))
+        score = dataclasses.replace(
+            score, amplitudes=-inverse @ (self.scores[at] / noise**2), covariance=inverse
+        )
+        return Ranked(probe, score, score.log_bayes)
+
+    # ------------------------------------------------------------------------------------------------ the columns
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        """Numbers of the distinct changes without a pattern over the field, by their texts."""
+        texts = dict.fromkeys(change.text for field in self.fields for change in field.changes)
+        return {text: number for number, text in enumerate(texts)}
+
+    @cached_property
+    def _of(self) -> list[list[int]]:
+        """Numbers of the changes of each candidate."""
+        return [[self._place[change.text] for change in field.changes] for field in self.fields]
+
+    @cached_property
+    def _columns(self) -> Float[np.ndarray, "d c"]:
+        """Columns of the distinct changes, without a pattern over the field, in units of the noise."""
+        distinct = {change.text: change for field in self.fields for change in field.changes}
+        columns = self.design.columns.of([[(1.0, change)] for change in distinct.values()])
+        return (columns / self.design.fit.noise_scale).astype(np.float32)
+
+    @cached_property
+    def _terms(self) -> Float[np.ndarray, "p f"]:
+        """Values of the terms of a smooth field at the field points, times their standard deviations."""
+        points, units = self.design.fit.calset.points, self.design.fit.model.template.units
+        sigma = np.array(
+            [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(SMOOTH_DEGREE)]
+        )
+        return np.asarray(legendre.basis(points.x, points.y, SMOOTH_DEGREE, units.field)) * sigma
+
+    @cached_property
+    def _rows_of_points(self) -> list[slice]:
+        """Rows of data of every field point; those of a point lie together."""
+        ends = np.cumsum(
+            np.bincount(self.design.point, minlength=len(self.design.fit.calset.points))
+        ).tolist()
+        return [slice(first, stop) for first, stop in zip([0, *ends], ends, strict=False)]
+
+    @cached_property
+    def _before(self) -> list[AnyMatrix]:
+        """Products of the columns of each candidate with one another, ahead of any projection."""
+        terms, grams = self._terms, list[AnyMatrix]()
+        for places in self._of:
+            own = np.ascontiguousarray(self._columns[:, places], float)
+            squares = np.stack([own[at].T @ own[at] for at in self._rows_of_points])
+            of_pairs = np.einsum("pf,pg->pfg", terms, terms).reshape(len(terms), -1)
+            gram = (squares.reshape(len(terms), -1).T @ of_pairs).reshape(
+                *squares.shape[1:], *(terms.shape[1],) * 2
+            )
+            grams.append(gram.transpose(0, 2, 1, 3).reshape(len(places) * terms.shape[1], -1))
+        return grams
