@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -219,7 +219,7 @@ class Step(FitComparison):
         likely = "above 0.99" if self.probability > 0.99 else f"{self.probability:.2g}"
         known = [f"probability {likely}"] if math.isfinite(self.probability) else []
         if self.descriptions:
-            words = " and ".join(_sentence(*entry)["words"] for entry in self.descriptions)
+            words = " and ".join(entry["words"] for entry in _said(self.descriptions))
             return f"{words} ({known[0]})" if known else words
         if change := self.choices.get("change", ""):
             return f"{change} ({self.effect})"
@@ -439,6 +439,41 @@ def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...
     )
 
 
+def _said(descriptions: Sequence[tuple[Change, float, float]]) -> Iterator[dict[str, Any]]:
+    """An entry of diagnosis.json for each description; the terms of a smooth field have one together."""
+    together: dict[str, list[tuple[Change, float, float]]] = {}
+    for change, amplitude, sigma in descriptions:
+        together.setdefault(change.candidate, []).append((change, amplitude, sigma))
+    for name, terms in together.items():
+        first = terms[0][0]
+        yield _sentence(*terms[0]) if name == first.text else _smooth(name, terms)
+
+
+def _smooth(name: str, terms: Sequence[tuple[Change, float, float]]) -> dict[str, Any]:
+    """The entry of a smooth field: `value` is its root mean square over a square field of the scale of the instrument.
+
+    The terms are products of Legendre polynomials, so that their mean squares add. `sigma` leaves out correlations of
+    their amplitudes.
+    """
+    sizes = np.array([(size * change.smooth_rms, error * change.smooth_rms) for change, size, error in terms])
+    value = float(np.sqrt(np.sum(sizes[:, 0] ** 2)))
+    sigma = (
+        float(np.sqrt(np.sum((sizes[:, 0] * sizes[:, 1]) ** 2))) / value
+        if value
+        else float(sizes[:, 1].max())
+    )
+    first = terms[0][0]
+    law = dataclasses.replace(first, factors=first.beside_field)
+    entry = _sentence(law, value, sigma)
+    dependence = ["in a smooth field (rms over the field)", *entry["dependence"]]
+    kind = entry["words"].partition(": ")[0]
+    words = f"{kind}, {', '.join(dependence)}: {entry['words'].partition(': ')[2].partition(',')[0]}"
+    further = {change.text: {"value": size, "sigma": error} for change, size, error in terms}
+    return entry | {
+        "sentence": name, "dependence": dependence, "words": words, "tested_by": first.tested_by, "terms": further,
+    }  # fmt: skip
+
+
 def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
     unit = Described.numbers()[change.parameter].unit
     value, error = value_and_error(amplitude, sigma)
@@ -468,7 +503,7 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*entry) for entry in step.descriptions],
+        "sentences": list(_said(step.descriptions)),
         "change_of_qu": step.change_of_qu,
         "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},

@@ -87,7 +87,7 @@ class Refits:
         return dataclasses.replace(refitted, item=item, expected=trial.expected)
 
     def _description(self, evidence: Examination, item: Ranked) -> Described:
-        """The description to be fitted: all terms of a smooth field, of other groups those that are worth their length."""
+        """The description to be fitted: all terms of a smooth field, else the members worth their length."""
         if evidence.smooth is not None and item.name in evidence.smooth.names:
             return Described.combine(item.probe.group, item.score.amplitudes)
         return self._with_best_times(evidence, shortest(item))

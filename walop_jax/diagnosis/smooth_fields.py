@@ -6,9 +6,10 @@ term is that of the same change without a pattern, times the values of the term 
 
 Equation    C_{cf} = c F_f,   C_{cf}ᵀ V = Σ_p F_pf (c_pᵀ V_p)
             and behind the free parameters and the disturbances of single exposures G = CᵀC − (CᵀB)(CᵀB)ᵀ, s = CᵀPr
-Symbols     c column of a change without a pattern over the field, c_p its rows of the field point p; F_pf value of the term
-            f there; V any columns of rows; B = [Q, Z] orthonormal basis Q of the derivatives by the free parameters,
-            Z Zᵀ the part that single exposures take up (`examination.common_mode`); P = 1 − BBᵀ; r residuals
+Symbols     c column of a change without a pattern over the field, c_p its rows of the field point p; F_pf value of the
+            term f there; V any columns of rows; B = [Q, Z] orthonormal basis Q of the derivatives by the free
+            parameters, Z Zᵀ the part that single exposures take up (`examination.common_mode`); P = 1 − BBᵀ;
+            r residuals
 Limits      Ghosts of the model, 10⁻³ of the light, carry the pattern of the field point at which they are seen, and not
             that of the opposite one, from which they come. A fit has them exactly.
 """

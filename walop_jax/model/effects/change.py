@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.model.conventions import OF_WALOP, Units
-from walop_jax.model.effects.factors import FIELD, Factor, factor
+from walop_jax.model.effects.factors import FIELD, Factor, factor, smooth_deviations
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import check_names
@@ -181,6 +181,13 @@ class Change:
         smooth = [item.text for item in self.grows_with if item.form == "field"]
         texts = (SMOOTH if item in smooth else item for item in self.text.split(" * "))
         return " * ".join(texts) if smooth else self.text
+
+    @property
+    def smooth_rms(self) -> float:
+        """Root mean square of its terms of a smooth field over a square field of the scale; 1 without such a term."""
+        terms = [item.given for item in self.grows_with if item.form == "field"]
+        degrees = [int(degree) for given in terms for degree in given]
+        return math.prod(smooth_deviations()[degree] / math.sqrt(2.0 * degree + 1.0) for degree in degrees)
 
     @property
     def parameter(self) -> str:
