@@ -108,10 +108,12 @@ class Trial:
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
-def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
+def log_evidence_ratio(
+    base: FitResult, extended: FitResult, scales: Float[np.ndarray, " t"] = SCALES
+) -> float:
     """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
 
-    Amplitudes are averaged over all `SCALES` of their prior widths.
+    Amplitudes are averaged over all `scales` of their prior widths.
     """
     base_names, model = set(base.model.names), extended.model
     widths = [
@@ -124,7 +126,7 @@ def log_evidence_ratio(base: FitResult, extended: FitResult) -> float:
     gain = 0.5 * (base.expansion.objective - extended.expansion.objective)
     first, second = (np.linalg.slogdet(fitted.expansion.matrix)[1] for fitted in (base, extended))
     occam = 0.5 * float(second - first)
-    at_all_scales = _of_amplitudes(extended, at) - _of_amplitudes(extended, at, np.ones(1))
+    at_all_scales = _of_amplitudes(extended, at, scales) - _of_amplitudes(extended, at, np.ones(1))
     return gain - occam - float(np.sum(np.log(widths))) + at_all_scales
 
 
@@ -144,24 +146,42 @@ def _of_amplitudes(result: FitResult, at: Sequence[int], scales: Float[np.ndarra
 
 
 def try_effect(
-    base: FitResult, instance: Effect, prior_shapes: int = 1, *, start: Vector | None = None
+    base: FitResult,
+    instance: Effect,
+    prior_shapes: int = 1,
+    *,
+    start: Vector | None = None,
+    scale: float = 1.0,
 ) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again.
 
-    Sentences join those that the model has. The prior of the name is divided among its `prior_shapes` shapes. The other
-    parameters start at their fitted values, or at `start`, if the misfit of the model has bent the fitted ones.
+    Sentences join those that the model has. The prior of the name is divided among its `prior_shapes` shapes, and the
+    prior widths of new sentences are multiplied with `scale`. The other parameters start at their fitted values, or at
+    `start`, if the misfit of the model has bent the fitted ones.
     """
     if isinstance(instance, Described):
         model = with_sentences(base.model, instance, base.calset)
+        for p in model.parameters if scale != 1.0 else ():
+            if p.name not in base.model.names and p.prior is not None:
+                model = model.change(p.name, prior=(p.prior[0], scale * p.prior[1]))
     else:
         model = with_effects(base.model, [instance], base.calset)
-    return _try_model(base, instance.kind, model, base.values if start is None else start, prior_shapes)
+    values = base.values if start is None else start
+    return _try_model(base, instance.kind, model, values, prior_shapes, scale)
 
 
 def _try_model(
-    base: FitResult, effect: EffectKind, model: Model, values: Float[np.ndarray, " n"], prior_shapes: int
+    base: FitResult,
+    effect: EffectKind,
+    model: Model,
+    values: Float[np.ndarray, " n"],
+    prior_shapes: int,
+    scale: float = 1.0,
 ) -> Trial:
-    """Fit a model with an effect, from values of the parameters of the base and its own start values of others."""
+    """Fit a model with an effect, from values of the parameters of the base and its own start values of others.
+
+    `scale` is the factor that the prior widths of its amplitudes have in the model already.
+    """
     start = dict(zip(base.model.names, values, strict=True))
     likelihood = Likelihood.of(base.calset, model)
     result = fit(
@@ -172,7 +192,7 @@ def _try_model(
     )
     bayes = -np.inf  # of a diverged fit
     if np.isfinite(result.expansion.matrix).all():
-        bayes = log_evidence_ratio(base, result) - float(np.log(prior_shapes))
+        bayes = log_evidence_ratio(base, result, SCALES / scale) - float(np.log(prior_shapes))
     return Trial(effect, bayes, result.chi2, result.explains_data, fit=result)
 
 

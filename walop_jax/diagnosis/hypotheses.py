@@ -66,12 +66,16 @@ class Probe:
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good."""
+    """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good.
+
+    `scale` is the factor on the prior widths of its amplitudes with which it is fitted: 1, but for smooth fields.
+    """
 
     probe: Probe
     score: Score
     log_bayes: float
     others: tuple[tuple[Probe, Score], ...] = ()
+    scale: float = 1.0
 
     @property
     def effect(self) -> EffectKind:

@@ -80,7 +80,7 @@ class Refits:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
             description = self._description(evidence, item)
-            refitted = try_effect(evidence.result, description, len(evidence.sentences))
+            refitted = try_effect(evidence.result, description, len(evidence.sentences), scale=item.scale)
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, shapes)
@@ -111,7 +111,8 @@ class Refits:
         Effects of the catalogue are not asked: their names support them.
         """
         single = any("exposure" in text for text in sentences_of(item.probe))
-        column = [evidence.candidate(item.probe.name)]
+        candidate = evidence.candidate(item.probe.name)
+        column = [dataclasses.replace(candidate, widths=item.scale * candidate.widths)]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
     def others(self, state: State) -> tuple[list[Trial], Mapping[str, Choice]]:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, SmoothField
-from walop_jax.diagnosis.score import ABSORBED, FAINTEST, Candidate, ScoreSpace, ScoreTable
+from walop_jax.diagnosis.score import ABSORBED, FAINTEST, SCALES, Candidate, ScoreSpace, ScoreTable, log_bayes
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.model import legendre
 from walop_jax.model.effects import Context
@@ -117,20 +117,22 @@ class SmoothFields:
         return self.fields[self._number[name]].probe(self.context)
 
     def ranked(self, name: str, noise: float) -> Ranked:
-        """One of them with its score, as a candidate that can be fitted; `noise` is the scatter of the residuals."""
+        """One of them with its score, as a candidate that can be fitted; `noise` is the scatter of the residuals.
+
+        Between the points a field is as large as its prior says. How large the field is as a whole the data know: it is
+        fitted with the most probable of the `SCALES` of the prior.
+        """
         number = self._number[name]
         stop = int(np.sum(self.sizes[: number + 1]))
-        at = slice(stop - self.sizes[number], stop)
-        probe, gram = self.probe(name), self.grams[number]
-        free, before = self.design.projector.free, np.diag(self._before[number])
+        scores, gram = self.scores[stop - self.sizes[number] : stop], self.grams[number]
+        probe, free, before = self.probe(name), self.design.projector.free, np.diag(self._before[number])
         space = ScoreSpace((name,), (self.sizes[number],), probe.widths, before, gram, free)
-        score = space.table_after(ScoreTable((), noise, 1.0, 1.0), self.scores[at])[name]
-        # Of many amplitudes, those are meant that the data and the prior together give.
-        inverse = np.linalg.inv(gram / noise**2 + np.diag(probe.widths**-2.0))
-        score = dataclasses.replace(
-            score, amplitudes=-inverse @ (self.scores[at] / noise**2), covariance=inverse
-        )
-        return Ranked(probe, score, score.log_bayes)
+        score = space.table_after(ScoreTable((), noise, 1.0, 1.0), scores)[name]
+        information, pull = gram / noise**2, scores / noise**2
+        scale = max(SCALES, key=lambda t: log_bayes(information, pull, probe.widths, np.array([t])))
+        covariance = np.linalg.inv(information + np.diag((scale * probe.widths) ** -2.0))
+        score = dataclasses.replace(score, amplitudes=-covariance @ pull, covariance=covariance)
+        return Ranked(probe, score, score.log_bayes, scale=float(scale))
 
     # ------------------------------------------------------------------------------------------------ the columns
 

@@ -1,0 +1,179 @@
+"""Smooth fields: their prior against draws of the process, their products against columns that are written out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_run import SMALL
+
+from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.examination import examine
+from walop_jax.diagnosis.findings import document
+from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.diagnosis.selection import JointScores
+from walop_jax.diagnosis.workflow import diagnose
+from walop_jax.fit.base_model import base_model
+from walop_jax.fit.refit import fit
+from walop_jax.likelihood.columns import own_columns
+from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model import legendre
+from walop_jax.model.effects import Described
+from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.factors import SMOOTH_DEGREE, SMOOTH_LENGTH, smooth_deviations
+from walop_jax.model.effects.in_models import known_effects
+from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
+from walop_jax.simulation.simulate import simulate
+
+
+def test_the_prior_is_that_of_coefficients_of_a_gaussian_process():
+    """Legendre coefficients of draws of the process with kernel exp(−Δ²/2ℓ²), whose variance is 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    kernel = np.exp(-0.5 * ((nodes[:, None] - nodes) / SMOOTH_LENGTH) ** 2)
+    value, vector = np.linalg.eigh(kernel)
+    draws = (vector * np.sqrt(np.clip(value, 0.0, None))) @ np.random.default_rng(1).standard_normal(
+        (60, 20_000)
+    )
+    for degree, sigma in enumerate(smooth_deviations()):
+        polynomial = np.polynomial.legendre.Legendre.basis(degree)(nodes)
+        coefficients = (degree + 0.5) * (weights * polynomial) @ draws
+        assert np.std(coefficients) == pytest.approx(sigma, rel=0.02)
+    # What the degrees to six hold of the variance of the process: nearly all.
+    held = sum(s**2 / (2 * i + 1) for i, s in enumerate(smooth_deviations()))
+    assert 0.99 < held < 1.0
+
+
+def test_the_size_of_a_smooth_field_is_its_rms_over_the_square():
+    """Mean square of Σ a f over a fine grid of the field, against the sum of the squares of a × rms of each term."""
+    terms = legendre.terms(SMOOTH_DEGREE)
+    changes = [Change.parsed(f"gain of O1 * field {i} {j}") for i, j in terms]
+    amplitudes = np.random.default_rng(2).standard_normal(len(terms))
+    edges = np.linspace(-0.3, 0.3, 400)
+    x, y = np.meshgrid(0.5 * (edges[1:] + edges[:-1]), 0.5 * (edges[1:] + edges[:-1]))
+
+    @dataclasses.dataclass
+    class At:
+        x: np.ndarray
+        y: np.ndarray
+
+    field = sum(a * c.factor(At(x, y)) for a, c in zip(amplitudes, changes, strict=True))
+    expected = np.sqrt(sum((a * c.smooth_rms) ** 2 for a, c in zip(amplitudes, changes, strict=True)))
+    assert np.sqrt(np.mean(field**2)) == pytest.approx(expected, rel=1e-3)
+    assert changes[0].candidate == "gain of O1 * smooth"
+    assert Change.parsed("gain of O1 * hours").candidate == "gain of O1 * hours"
+
+
+@pytest.fixture(scope="module")
+def examined():
+    calset = simulate(SMALL, seed=3).calset
+    model = base_model(calset)
+    result = fit(Likelihood.of(calset, model))
+    listed = hypotheses(known_effects(model), model.template, calset.exposures, len(calset.points))
+    few = Hypotheses(listed.names[:4], listed.sentences[:60], (), listed.effects, (), listed.smooth)
+    return examine(result, few, np.random.default_rng(0))
+
+
+PLACES = (
+    "retardance q behind collimator * smooth; retardance u behind collimator * smooth",
+    "depolarisation of polariser * kelvin * smooth",
+    "diattenuation v ahead of polariser * smooth * kind moon",
+    "gain of O1 * counts * smooth",
+)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_columns_are_derivatives_of_the_whole_light_path(examined, name):
+    """Each term of the field in the light path, differentiated."""
+    smooth, fit_ = examined.smooth, examined.result
+    texts = [text for member in smooth.probe(name).group for text in member.sentences]
+    chosen = [0, 1, 9, len(texts) - 1]
+    effect = Described.saying([texts[k] for k in chosen], np.zeros(len(chosen)))
+    theirs = own_columns(fit_.likelihood, fit_.values, [effect]) / fit_.noise_scale
+    ours = smooth.columns(name)[:, chosen]
+    assert np.all(np.linalg.norm(ours - theirs, axis=0) < 1e-6 * np.linalg.norm(theirs, axis=0))
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_products_are_those_of_columns_written_out(examined, name):
+    smooth, design = examined.smooth, examined.design
+    written = smooth.behind(design.stacked([smooth.candidate(name).columns]))
+    number = smooth.names.index(name)
+    at = slice(sum(smooth.sizes[:number]), sum(smooth.sizes[: number + 1]))
+    scale = np.outer(*2 * [np.sqrt(np.diag(smooth.grams[number]))])
+    assert np.abs(
+        written.T @ design.stacked([smooth.candidate(name).columns]) - smooth.grams[number]
+    ).max() < (1e-5 * scale.max())
+    expected = written.T @ design.residual
+    assert np.abs(smooth.scores[at] - expected).max() < 1e-4 * max(1.0, np.abs(expected).max())
+    other = examined.space.names[0]
+    across = examined.products_with(other)[len(examined.scores) :][at]
+    column = design.stacked([examined.candidates[other].columns])
+    expected = written.T @ column
+    norm = np.outer(np.linalg.norm(written, axis=0), np.linalg.norm(column, axis=0))
+    assert np.abs(across - expected).max() < 1e-5 * norm.max()
+
+
+def test_evidence_beside_a_smooth_field_is_a_ratio_of_densities(examined):
+    """ln p(r | field and g) − ln p(r | field) of normal residuals, by the determinant lemma on columns written out."""
+    candidates, smooth, design = JointScores(examined), examined.smooth, examined.design
+    noise = examined.table.noise_scale
+    name, other = PLACES[1], "gain of O1 * counts * smooth"
+    member = (candidates.names.index(name), 0.3)
+
+    def log_density(columns):
+        """ln p(P r) but for constants: r ~ N(0, noise² + C Cᵀ), in the rows behind the free parameters."""
+        projected = smooth.behind(columns)
+        matrix = np.eye(columns.shape[1]) + columns.T @ projected / noise**2
+        along = projected.T @ design.residual / noise**2
+        return 0.5 * along @ np.linalg.solve(matrix, along) - 0.5 * np.linalg.slogdet(matrix)[1]
+
+    def column(which, scale):
+        number = smooth.names.index(which)
+        at = slice(sum(smooth.sizes[:number]), sum(smooth.sizes[: number + 1]))
+        return scale * design.stacked([smooth.candidate(which).columns]) * smooth.widths[at]
+
+    given = column(name, 0.3)
+    both = np.hstack([given, column(other, 1.0)])
+    found = candidates.beside([member])[candidates.names.index(other), 0]
+    assert found == pytest.approx(log_density(both) - log_density(given), abs=1e-3)
+
+
+PLAN = ObservingPlan(
+    grid=7, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=4, standards=4
+)
+
+
+def test_a_field_of_plane_waves_is_told_with_its_place_and_law():
+    """A sum of plane waves, which is no polynomial: its place and law are named, and the field is that."""
+    calset, truth = simulate(PLAN, seed=5)
+    e = calset.exposures  # a temperature that does not follow the time
+    calset = dataclasses.replace(
+        calset, exposures=dataclasses.replace(e, temp=10.0 + np.cos(2.0 * np.arange(len(e))))
+    )
+    waves = np.random.default_rng(6).normal(0.0, 5.0, (3, 2))
+    block = calset.intensities.block(0, len(calset.points))
+    field = np.cos(waves @ np.stack([calset.points.x, calset.points.y])).sum(axis=0)
+    hours = 24.0 * (calset.exposures.mjd - calset.exposures.mjd.min())
+    factor = 1.0 + 4e-3 * field[:, None] * hours
+    counts = np.array(block.counts)
+    counts[..., 1] *= factor
+    changed = dataclasses.replace(block, counts=counts)
+    calset = dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, changed))
+    found = diagnose(calset)
+    assert found.verdict == "effect_found"
+    (step,) = found.steps
+    camera = truth.cameras.names[1]
+    assert {change.candidate for change, *_ in step.descriptions} == {f"gain of {camera} * hours * smooth"}
+    assert found.after.explains_data
+    # The terms give the field: amplitude × term, summed, is what was put in, to the error of the field.
+    (entry,) = document(found)["steps"][0]["sentences"]
+    x, y = calset.points.x, calset.points.y
+    basis = {
+        f"field {i} {j}": b for (i, j), b in zip(legendre.terms(6), legendre.basis(x, y, 6).T, strict=True)
+    }
+    sigma = smooth_deviations()
+    told = np.zeros(len(x))
+    for text, term in entry["terms"].items():
+        i, j = map(int, text.rpartition("field ")[2].split())
+        told += term["value"] * sigma[i] * sigma[j] * basis[f"field {i} {j}"]
+    assert np.sqrt(np.mean((told - 4e-3 * field) ** 2)) < 0.1 * np.std(4e-3 * field)
