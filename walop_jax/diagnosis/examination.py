@@ -125,10 +125,15 @@ class Evidence:
         """Effects in order of evidence."""
         return rank(self.table, self.probes)
 
+    @property
+    def price(self) -> float:
+        """Logarithm of the number of descriptions, which share the prior of one name: each pays it."""
+        return float(np.log(max(len(self.sentences), 1)))
+
     @cached_property
     def ranked_sentences(self) -> list[Ranked]:
         """Sentences in order of evidence, each less the logarithm of their number."""
-        price = float(np.log(max(len(self.sentences), 1)))  # all of them share the prior of one name
+        price = self.price
         scored = [(probe, self.table[probe.name]) for probe in self.sentences]
         candidates = (Ranked(p, s, s.log_bayes - price) for p, s in scored if s.testable)
         return sorted(candidates, key=lambda item: -item.log_bayes)

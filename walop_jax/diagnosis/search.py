@@ -306,7 +306,8 @@ def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
 def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
     """The candidate of a name, with the shapes that it may have as this thing; None where it cannot be fitted."""
     if evidence.smooth is not None and name in evidence.smooth.names:
-        return evidence.smooth.ranked(name, evidence.table.noise_scale)
+        item = evidence.smooth.ranked(name, evidence.table.noise_scale)
+        return dataclasses.replace(item, log_bayes=item.log_bayes - evidence.price)
     item = evidence.by_name.get(name)
     shapes = [p for p in thing.shapes.get(name, ()) if item is not None and p.effect is item.effect]
     if item is None or not shapes:
