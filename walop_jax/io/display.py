@@ -112,7 +112,7 @@ def _cell(tag: str, text: str, column: str = "") -> str:
     return f'<{tag} style="text-align: {side}">{html.escape(text)}</{tag}>'
 
 
-class Listed:
+class ShortDir:
     """Something whose `dir`, and with it the completion of names in a session, lists what a user may want.
 
     `_working` are the parts and methods by which other rooms make and change it: they are left out.
@@ -125,7 +125,7 @@ class Listed:
         return sorted(set(super().__dir__()) - working)
 
 
-class Displayed(Listed, abc.ABC):
+class Displayed(ShortDir, abc.ABC):
     """Something that shows itself as a short table instead of as everything that it holds."""
 
     @abc.abstractmethod

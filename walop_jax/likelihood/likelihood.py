@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
-from walop_jax.io.display import Listed
+from walop_jax.io.display import ShortDir
 from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
@@ -182,7 +182,7 @@ def prior_rows(model: Model) -> PriorRows:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Likelihood(Listed):
+class Likelihood(ShortDir):
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in batches of equal size (`likelihood/layout.py`), several of them at a time
