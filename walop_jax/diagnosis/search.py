@@ -9,15 +9,16 @@
    a thing is confirmed, the next thing is tried, unless the first one is best described by a pattern: a weaker thing
    would then be fitted to a model that lacks the stronger one, and imitate it.
 
-All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `Judge` says
-what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps (`tests/diagnosis/linear_judge.py`).
+All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `TrialJudge`
+says what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps
+(`tests/diagnosis/linear_judge.py`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -73,18 +74,35 @@ class State:
     ended: str = ""
 
 
-Judge = Any
-"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone:
+@runtime_checkable
+class TrialJudge(Protocol):
+    """What an addition to a model is worth: by exact fits (`refits.Refits`), or by linear steps alone.
 
-over        amount of work after which nothing further is tried, in words; empty: there is more to spend
-fitted      a trial that has a linear step, with what the judge finds for it: Refits fits it exactly
-others      trials of effects without a linear step, and the other descriptions of the instrument that were compared
-confronted  a trial with its test against held-out data
-adopted     the state after a trial has joined the model
-"""
+    The evidence that it is given is the one that it put into its states: Refits works with an `Examination`.
+    """
+
+    def over(self, fits: int) -> str:
+        """Amount of work after which nothing further is tried, in words ("40 fits"); empty: there is more to spend."""
+        ...
+
+    def fitted(self, evidence: Any, trial: Trial) -> Trial:
+        """A trial that has a linear step, with what the judge finds for it: Refits fits it exactly."""
+        ...
+
+    def others(self, state: State) -> tuple[Sequence[Trial], Mapping[str, Choice]]:
+        """Trials of effects without a linear step, and the other descriptions of the instrument that were compared."""
+        ...
+
+    def confronted(self, evidence: Any, trial: Trial) -> Trial:
+        """A trial with its test against held-out data."""
+        ...
+
+    def adopted(self, state: State, trial: Trial) -> State:
+        """The state after a trial has joined the model."""
+        ...
 
 
-def search(state: State, judge: Judge) -> State:
+def search(state: State, judge: TrialJudge) -> State:
     """The state in which nothing is missing, or nothing more can be added."""
     for _ in range(thresholds.MOST_STEPS):
         if not state.evidence.alarm:
@@ -159,7 +177,7 @@ class _RoundInProgress:
     """
 
     state: State
-    judge: Judge
+    judge: TrialJudge
     posterior: MissingThings
     fits: int
     choices: Mapping[str, Choice]
@@ -167,7 +185,7 @@ class _RoundInProgress:
     others_asked: bool = False
 
     @classmethod
-    def of(cls, state: State, judge: Judge) -> _RoundInProgress:
+    def of(cls, state: State, judge: TrialJudge) -> _RoundInProgress:
         """The round of a state, in which nothing has been tried."""
         return cls(state, judge, most_probable(state.evidence), state.fits, state.choices)
 
@@ -279,7 +297,7 @@ class _RoundInProgress:
         return f"{best} is more probable: {thing.probabilities[best]:.2g}, and this {probability:.1g}"
 
 
-def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
+def _next(state: State, judge: TrialJudge) -> tuple[Trial | None, State]:
     """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
     turn, accepted = _RoundInProgress.of(state, judge), None
     things = list(turn.posterior.things)
