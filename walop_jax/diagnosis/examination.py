@@ -160,7 +160,10 @@ class Evidence:
         return self.table.noise_scale if self.table.noise_scale > thresholds.FLOOR else 1.0
 
     def by_fit(self, score: Score) -> float:
-        """Difference of the evidence that a fit finds, with its errors, from that in units of the remaining noise."""
+        """What a fit of this candidate finds as ln B, less its ln B by the linear step.
+
+        Fits count in errors as stated, linear steps in units of the scatter behind all candidates (`noise_scale`).
+        """
         return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
 
     @cached_property
