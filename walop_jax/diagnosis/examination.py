@@ -151,7 +151,7 @@ class Evidence:
         return self.chi2 > thresholds.POOR_FIT * self.dof
 
     @property
-    def floor(self) -> float:
+    def scatter(self) -> float:
         """Scatter behind all candidates, in standard deviations of the data as stated; 1 or more.
 
         Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
@@ -203,7 +203,7 @@ class Evidence:
         """Effects indistinguishable from a candidate, by linear steps; the nearest first."""
         apart = self.nearest(self.apart(item))
         apart.pop(item.effect.name, None)
-        close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
+        close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.scatter}
         return tuple(sorted(close, key=close.__getitem__))
 
     def classes(self) -> Iterator[dict[str, Any]]:
@@ -299,7 +299,7 @@ class Examination(Evidence):
         projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
         scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)
         distances = self.nearest(separations(space, scores, float(projected @ projected)))
-        return {rival: apart / self.floor for rival, apart in distances.items()}
+        return {rival: apart / self.scatter for rival, apart in distances.items()}
 
     def is_like(self, design: Design) -> bool:
         """True if the expected counts of another fit are close enough to reuse its columns."""

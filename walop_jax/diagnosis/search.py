@@ -219,7 +219,7 @@ class _RoundInProgress:
                 break
             self.fits += 1
             trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
-            worth = expected + (trial.evidence - trial.expected) / self.evidence.floor**2
+            worth = expected + (trial.evidence - trial.expected) / self.evidence.scatter**2
             if self.passes(trial) and not self._is_pattern(thing, trial, worth):
                 passed.append((worth, trial))
         return passed
@@ -253,7 +253,7 @@ class _RoundInProgress:
         self.others_asked = True
         trials, self.choices = self.judge.others(dataclasses.replace(self.state, fits=self.fits))
         self.fits += len(trials)
-        unit = self.evidence.floor**2
+        unit = self.evidence.scatter**2
         best = max(names, key=lambda pair: pair[1].evidence, default=None)
         level = 0.0 if best is None else best[0] - best[1].evidence / unit
         return [(level + trial.evidence / unit, trial) for trial in trials if self.passes(trial)]
