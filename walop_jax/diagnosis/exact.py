@@ -63,7 +63,7 @@ class Trial:
     refused          the reason for which it was not added; empty while nothing speaks against it
     score, p_value   of the linear test at the time when it was added
     groups           groups of sentences added one after the other, each with the candidates that were as good then
-    also             other names (`synonyms`) of the trial, and of its `nameless` rivals
+    synonyms         other names (`synonyms.synonyms`) of the trial, and of its `nameless` rivals
     """
 
     effect: EffectKind
@@ -83,7 +83,7 @@ class Trial:
     against: str = ""
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     probability: float = float("nan")
 
     @property

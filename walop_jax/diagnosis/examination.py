@@ -86,8 +86,8 @@ class Evidence:
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are reported as
     the effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
-    `dof` are those of the fit, `scale` the factor on the errors with which it was made. `also` are the other names of
-    candidates (`synonyms`).
+    `dof` are those of the fit, `scale` the factor on the errors with which it was made. `synonyms` are other
+    names of candidates (`synonyms.synonyms`).
     """
 
     space: ScoreSpace
@@ -101,7 +101,7 @@ class Evidence:
     chi2: float
     dof: int
     scale: float = 1.0
-    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     @property
     def asked(self) -> tuple[Probe, ...]:
@@ -322,7 +322,7 @@ def examine(
     again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    known = earlier.also if earlier is not None else {} if synonyms_apart else None
+    known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
@@ -375,7 +375,7 @@ def examine(
         design=design,
         candidates=candidates,
         bare=bare,
-        also=known,
+        synonyms=known,
     )
 
 

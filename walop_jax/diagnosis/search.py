@@ -351,6 +351,6 @@ def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: 
         trial,
         rivals=tuple(name for name in names if name in effects),
         nameless=nameless,
-        also={name: evidence.also[probe] for name, probe in probes.items() if probe in evidence.also},
+        synonyms={n: evidence.synonyms[probe] for n, probe in probes.items() if probe in evidence.synonyms},
         probability=float(np.exp(worth[trial.name] - np.logaddexp.reduce(list(logs.values())))),
     )
