@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 
+import jax
 import pytest
 from small_run import SEED, SMALL, small_fit
 
@@ -19,6 +20,30 @@ def test_effects_are_short_and_have_units():
     assert max(map(len, shown)) < LONGEST
     assert "hwp1_axis(angle [deg])" in shown
     assert len(repr(walop.EFFECTS)) < 5000
+
+
+def test_effects_at_some_values_are_lines():
+    context = walop.ObservingPlan(grid=3).context()
+    for kind in walop.EFFECTS:
+        line = repr(kind.neutral(context))
+        assert line.startswith(f"{kind.name}(")
+        assert len(line) < LONGEST
+        assert "\n" not in line
+    turned = walop.effect_by_name("hwp1_axis").of(context, angle=0.3)
+    assert repr(turned) == "hwp1_axis(angle=0.3 deg)"
+    spot = walop.effect_by_name("blemish").of(context, x=0.1, depth=0.02, camera="E1")
+    assert repr(spot) == "blemish(x=0.1 deg, y=0 deg, size=0.05 deg, depth=0.02, camera=1)"
+    shapes = jax.eval_shape(lambda effect: effect, turned)
+    assert repr(shapes) == "hwp1_axis(angle=?)"
+
+
+def test_parts_of_a_fit_are_lines():
+    result = small_fit()
+    parts = [*result.model.parameters, result.minimum, result.expansion, result.likelihood]
+    assert max(len(repr(part)) for part in parts) < LONGEST
+    assert repr(result.model["half1.wedge"]) == (
+        "Parameter half1.wedge = -0.23 rad, prior -0.23 ± 0.001, free: wedge angle"
+    )
 
 
 def test_parts_of_a_set_and_its_likelihood_are_lines():
@@ -62,11 +87,13 @@ def test_working_parts_are_not_between_results():
         (result, ("with_verdict", "with_doubt", "with_remark", "checked_verdict", "shown", "of")),
         (calibration, ("shown", "widened", "with_covariance", "matrix_columns")),
         (result.verdict, ("on_top_of", "recorded", "answers")),
+        (result.likelihood, ("data_terms", "with_errors_at", "points_as_stated", "left", "of")),
     ):
         assert [name for name in working if not hasattr(one, name)] == []
         assert set(working) & set(dir(one)) == set()
     assert {"residuals", "to_table", "trusted", "covariance", "plot", "save"} <= set(dir(result))
     assert {"matrix", "flags", "covariance", "maps"} <= set(dir(calibration))
+    assert {"residuals", "jacobian", "expand", "model", "priors"} <= set(dir(result.likelihood))
 
 
 def test_help_lists_every_argument_of_refit():

@@ -14,7 +14,7 @@ from own_instrument import OWN
 from small_run import small_fit
 
 import walop_jax as walop
-from walop_jax.commands.command import Command, Outcome, given, typed
+from walop_jax.commands.command import Command, Outcome, given, typed, with_own_classes
 from walop_jax.posterior.run import Run
 
 PLAN = "grid = 2\nstandard_grid = 1\npolariser_angles = 4\nmoon_patches = 2\nstandards = 3\n"
@@ -220,6 +220,18 @@ def test_lines_to_type_are_quoted_and_left_out_where_they_cannot_be_typed():
     assert typed("report", None) == ""
     assert typed("apply", small_fit, "STARS.fits") == ""
     assert given(model=None, instrument=Path("own.toml")) == ["--instrument", Path("own.toml")]
+
+
+def test_lines_to_type_name_the_files_of_own_classes():
+    """Without them the calibration of an instrument with an element of one's own is not read."""
+    steps = ("walop-jax report RUN", "walop-jax refit s.fits --elements my.py -o RUN", "topcat OUT.vot", "")
+    assert with_own_classes(steps, Path("my.py"), Path("own effects.py")) == (
+        "walop-jax report RUN --elements my.py --effects 'own effects.py'",
+        "walop-jax refit s.fits --elements my.py -o RUN --effects 'own effects.py'",
+        "topcat OUT.vot",
+        "",
+    )
+    assert with_own_classes(steps, None, Path("own.toml")) == steps
 
 
 def test_suggested_paths_with_blanks_can_be_typed(call, calset_file, here: Path):

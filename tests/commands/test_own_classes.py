@@ -141,6 +141,8 @@ def test_what_is_fitted_with_an_element_of_ones_own_is_read(own: Path, call):
     assert done.exit_code == 0, done.output
     done = call("refit", "set.fits", "--instrument", "three.toml", "-o", "RUN", *with_class)
     assert done.exit_code == 0, done.output
+    apply = "walop-jax apply RUN STARS.fits -o OUT.fits --elements grey.py"
+    assert f"Next: walop-jax report RUN --elements grey.py or {apply}" in done.stderr
     held = walop.read("RUN", elements="grey.py").calibration
     assert held is not None
     assert held["grey.loss"].value == pytest.approx(0.3, abs=0.1)

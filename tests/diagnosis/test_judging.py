@@ -17,12 +17,15 @@ from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit
+from walop_jax.fit.model_file import model_without_data
+from walop_jax.fit.refit import FitResult, fit
+from walop_jax.io.code import blank
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, FreeForm, effect_by_name
 from walop_jax.model.effects.free_form import BLOCKS
 from walop_jax.model.effects.in_models import effect_context, with_effects
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.simulation.observing_plan import polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -44,6 +47,25 @@ def test_density_at_neutral_is_the_evidence_of_two_fits(leaking):
     by_fits = exact.log_evidence_ratio(base, extended)
     assert by_fits > 5.0
     assert exact.evidence_of_presence(extended, "camera_leakage") == pytest.approx(by_fits, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("mean", "width", "measured", "error"), [(0.0, 1e-3, 4e-4, 2e-4), (2e-4, 3e-4, -1e-4, 5e-4)]
+)
+def test_evidence_of_one_number_is_an_integral_over_its_prior(mean, width, measured, error):
+    """One amplitude measured as `measured` ± `error`, its prior `mean` ± `width`: ∫ p(data|a) p(a) da by quadrature."""
+    model = with_effects(model_without_data(nominal_instrument()), ["camera_leakage"], PLAN.context())
+    model = model.change("camera_leakage.share", prior=(mean, width))
+    at = model.index("camera_leakage.share")
+    values, covariance = model.start.copy(), np.eye(len(model.start))
+    covariance[at, at] = 1.0 / (error**-2 + width**-2)
+    values[at] = covariance[at, at] * (measured / error**2 + mean / width**2)
+    result = blank(FitResult)
+    vars(result).update(likelihood=SimpleNamespace(model=model), values=values, covariance=covariance)
+    found = exact.evidence_of_presence(result, "camera_leakage")
+    prior, data = stats.norm(mean, width).pdf, stats.norm(measured, error).pdf
+    there = integrate.quad(lambda a: prior(a) * data(a), mean - 9 * width, mean + 9 * width)[0]
+    assert found == pytest.approx(np.log(there / data(mean)), abs=1e-6)
 
 
 def test_evidence_of_many_numbers_is_the_mean_over_fits_with_priors_of_four_widths(leaking):

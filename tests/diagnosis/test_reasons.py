@@ -5,8 +5,10 @@ import pytest
 from linear_judge import Linear
 from test_naming_search import NAMES, evidence
 
+from walop_jax.diagnosis.findings import of_diagnosis
 from walop_jax.diagnosis.reasons import why
 from walop_jax.diagnosis.search import State, search
+from walop_jax.fit.verdict import Doubt, Quality, Verdict
 
 STEP = {
     "effect": "clp_zero",
@@ -129,3 +131,26 @@ def test_what_a_pattern_explains_better_is_told():
     assert all(
         "a pattern without a name is more probable" in text or "was added first" in text for text in reasons
     ), reasons
+
+
+def test_a_diagnosis_does_not_send_to_a_diagnosis():
+    """Its first line ended with "walop-jax diagnose looks for missing effects"."""
+    doubts = (
+        Doubt(
+            Quality.UNEXPLAINED, "χ²/dof = 7; do not use this (walop-jax diagnose looks for missing effects)"
+        ),
+        Doubt(
+            Quality.DOUBTED, "the residuals hold patterns (p = 1e-5): walop-jax diagnose looks for the cause"
+        ),
+        Doubt(Quality.UNEXPLAINED, "χ²/dof = 7"),
+        Doubt(Quality.NOT_CONVERGED, "no step lowers χ² any more"),
+    )
+    fit = Verdict(doubts=doubts)
+    assert all("walop-jax diagnose" in doubt.words for doubt in doubts[:3])
+    found = of_diagnosis(fit, None, "Diagnosis", complete=False).doubts
+    words = [doubt.words for doubt in found]
+    assert not [text for text in words if "walop-jax diagnose" in text]
+    assert words[0] == "χ²/dof = 7; do not use this; walop-jax report shows where it is"
+    assert words[1] == "the residuals hold patterns (p = 1e-5); walop-jax report shows where it is"
+    assert words[3] == doubts[3].words
+    assert [doubt.bit for doubt in found[:4]] == [doubt.bit for doubt in doubts]

@@ -54,7 +54,7 @@ def asked() -> Examination:
 
 def test_what_says_the_same_is_one_candidate(asked):
     """Behind the polariser there is the collimator alone: what turns light there turns it behind the collimator too."""
-    assert asked.also == {TURNED[0]: (TURNED[1],)}
+    assert asked.synonyms == {TURNED[0]: (TURNED[1],)}
     assert sorted(probe.name for probe in asked.sentences) == sorted([TURNED[0], *LOST])
     assert set(asked.space.names) == set(asked.bare.names) == set(asked.candidates)
     assert TURNED[1] not in asked.candidates
@@ -90,7 +90,7 @@ def test_a_name_of_the_catalogue_goes_before_what_describes_it():
     every = sentences(fit.model.template, fit.calset.exposures, len(fit.calset.points))
     some = [probe for probe in every if probe.name == longer]
     found = examine(fit, Hypotheses(names=[name], sentences=some), np.random.default_rng(0))
-    assert found.also == {"standard_angles": (longer,)}
+    assert found.synonyms == {"standard_angles": (longer,)}
     assert not found.sentences
     np.testing.assert_array_equal(found.candidates["standard_angles"].widths, name.widths)
     again = examine(fit, Hypotheses(names=[name]), np.random.default_rng(0))
@@ -98,4 +98,4 @@ def test_a_name_of_the_catalogue_goes_before_what_describes_it():
     assert evidence[0] == pytest.approx(evidence[1], rel=1e-3)
     # Where the light has hardly changed, columns and names of an earlier examination serve again.
     later = examine(fit, Hypotheses(names=[name], sentences=some), np.random.default_rng(0), found)
-    assert (later.also, later.sentences) == (found.also, ())
+    assert (later.synonyms, later.sentences) == (found.synonyms, ())

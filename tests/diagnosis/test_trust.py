@@ -17,6 +17,7 @@ from small_run import SMALL
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import CalibrationSet, FineStructure
 from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.score import Projector
 from walop_jax.diagnosis.trust import examined, group_scores
 from walop_jax.fit import refit as fitting
 from walop_jax.fit.refit import FitResult
@@ -225,6 +226,31 @@ def test_squares_of_groups_follow_their_distribution(south_set, south_fit):
         assert first.name.startswith("camera")
         assert first.p_value < 1e-9
         assert (first.ratio < 1.0) is (factor < 1.0)
+
+
+def test_squares_of_an_exposure_are_compared_with_the_rest_as_in_an_f_test(plain):
+    """Four cameras with one flux leave three independent data: the ratio of variances then follows F (scipy)."""
+    design = Design.of(plain)
+    nothing = Projector(np.zeros((len(design.residual), 0)))  # no parameter was fitted
+    used, cameras = design.measured.used, design.measured.cameras
+    unit = design.measured.model[used]
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    noise = np.random.default_rng(5).normal(size=unit.shape)
+    noise -= np.sum(noise * unit, axis=1, keepdims=True) * unit
+    exposure = np.nonzero(used)[1]
+    count = (cameras - 1) * np.array([np.sum(exposure == 0), np.sum(exposure != 0)])
+    square = [np.sum(noise[exposure == 0] ** 2), np.sum(noise[exposure != 0] ** 2)]
+    for ratio in (0.75, 0.9, 1.1, 1.3):
+        factor = np.sqrt(ratio * square[1] / square[0] * count[0] / count[1])
+        rows = np.zeros_like(design.residual)
+        rows[: design.rows] = (noise * np.where(exposure == 0, factor, 1.0)[:, None]).reshape(-1)
+        drawn = dataclasses.replace(design, residual=rows)
+        vars(drawn)["projector"] = nothing
+        found = {score.name: score for score in group_scores(drawn)}
+        score = found[f"exposure {plain.calset.exposures.exposure[0]}"]
+        assert score.ratio == pytest.approx(ratio)
+        above = stats.f(*count).sf(ratio)
+        assert score.p_value == pytest.approx(2.0 * min(above, 1.0 - above), abs=0.01)
 
 
 def test_an_examination_changes_no_value(plain, clean):

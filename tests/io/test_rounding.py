@@ -23,7 +23,7 @@ from walop_jax.io.text import (
         (12345.6, 78.9, "12346 ± 79"),
         (12345.6, 789.0, "12350 ± 790"),
         (1.0, 0.15, "1.00 ± 0.15"),
-        (2.5e-12, 1e-13, "2.50e−12 ± 1.0e−13"),
+        (2.5e-12, 1e-13, "2.50e-12 ± 1.0e-13"),
         (4.0, 0.0, "4"),
     ],
 )
@@ -58,7 +58,7 @@ def test_rounding_noise_is_no_result():
     """Effects on q, u or p below 10⁻⁸ are noise of float64 optics; in per cent 10⁻⁶."""
     assert [per_cent(share) for share in (0.0023, 1.2e-7, 4.5e-19, 0.0)] == [
         "0.23",
-        "1.2e−05",
+        "1.2e-05",
         "< 10⁻⁶",
         "0.0",
     ]

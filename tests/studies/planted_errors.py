@@ -113,8 +113,8 @@ ERRORS = (
     # likelihood, covariance, degrees of freedom, engine
     planted("likelihood/flux.py", "return flux, weighted_counts - flux * weighted_model",
             "return flux, weighted_counts - best * weighted_model", *_LIKELIHOOD),
-    planted("likelihood/flux.py", "share = shared.summed(columns * along) / xp",
-            "share = 0.999 * shared.summed(columns * along) / xp", *_LIKELIHOOD),
+    planted("likelihood/flux.py", "component = shared.summed(columns * along) / xp",
+            "component = 0.999 * shared.summed(columns * along) / xp", *_LIKELIHOOD),
     planted("likelihood/engine.py", "jacobian @ r, jacobian @ jacobian.T", "jacobian @ r, 1.01 * jacobian @ jacobian.T",
             "likelihood/test_nodes.py"),
     planted("likelihood/engine.py", "cross = jnp.einsum(\"pimk,pmt->ikt\", by_site, basis)",

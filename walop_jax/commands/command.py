@@ -118,7 +118,6 @@ class Job:
 
     `overwrite`: replace outputs that exist. `seed`: of random numbers. `progress` is called with each step. `folder`
     is the reserved folder of results (None: nothing is written). `typed`: on the command line, not from Python.
-    `elements` are the kinds of elements of one's own, which have been loaded.
     """
 
     overwrite: bool = False
@@ -126,7 +125,6 @@ class Job:
     progress: Tell = lambda text: None
     folder: OutputFolder | None = None
     typed: bool = False
-    elements: PathLike | Sequence[type] | None = None
     began: float = dataclasses.field(default_factory=time.perf_counter)
 
     def tell(self, text: str, stage: str = "") -> None:
@@ -179,6 +177,23 @@ def after_fit(folder: object, *, usable: bool = True) -> tuple[str, ...]:
     """Command lines to type after a fit: its page, and stars corrected with it if it is `usable`."""
     stars = typed("apply", folder, "STARS.fits", "-o", "OUT.fits")
     return (typed("report", folder), stars) if usable else (typed("report", folder),)
+
+
+def with_own_classes(steps: Sequence[str], elements: object, effects: object) -> tuple[str, ...]:
+    """Command lines to type next, with the Python files of a user's own kinds of elements and effects.
+
+    What was fitted with such a class is read with its file alone. Effects of a TOML file need none: results hold them.
+    """
+    files = {"--elements": elements, "--effects": effects}
+    python = {option: file for option, file in files.items() if str(file).endswith(".py")}
+
+    def completed(step: str) -> str:
+        missing = [
+            word for option, file in python.items() if option not in step for word in (option, str(file))
+        ]
+        return f"{step} {shlex.join(missing)}" if missing and step.startswith("walop-jax ") else step
+
+    return tuple(map(completed, steps))
 
 
 def given(**options: object) -> list[object]:
@@ -378,7 +393,12 @@ class Command(Generic[T]):
             from walop_jax.model.elements.registry import load_elements
 
             load_elements(elements)
-            job = dataclasses.replace(job, elements=elements)
+        outcome = self._written(job, arguments)
+        steps = with_own_classes(outcome.next, elements, arguments.get("effects"))
+        return dataclasses.replace(outcome, next=steps)
+
+    def _written(self, job: Job, arguments: dict[str, Any]) -> Outcome[T]:
+        """The outcome of the body, with its results written."""
         output, names = arguments.get("output"), self.writes
         self._check_apart(arguments)
         body = self._body_of(arguments)

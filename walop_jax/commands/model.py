@@ -70,7 +70,7 @@ def model(
     text = render(base)
     if output is not None:
         write_text(output, text, overwrite=job.overwrite)
-    options = given(instrument=instrument, effects=effects, elements=job.elements)
+    options = given(instrument=instrument, effects=effects)
     refit = typed("refit", *several(calsets), *options, "--model", output, "-o", "RUN")
     model_file = ModelFile(base, text, None if output is None else Path(output))
     text = text if output is None else model_file.display().title

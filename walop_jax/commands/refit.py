@@ -133,7 +133,7 @@ def refit(
     rows, cameras = result.clipped, result.model.template.cameras.names
     brief = dataclasses.replace(shown, rows=(), notes=()).text()
     written = "" if output is None else f"Written to {output}."
-    options = {"instrument": instrument, "effects": effects, "elements": job.elements}
+    options = {"instrument": instrument, "effects": effects}
     outcome = Outcome(
         result,
         summary(

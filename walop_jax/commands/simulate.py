@@ -189,7 +189,7 @@ def simulate(
         about |= {"exposures": len(calset.exposures), "points": len(calset.points)}
         about["rows"] = calset.intensities.rows
         text = f"{output}: {plan.name}, {about['exposures']} exposures of {about['points']} points"
-        options = given(instrument=file, elements=job.elements) if plan.design.description else ()
+        options = given(instrument=file) if plan.design.description else ()
         step = typed("refit", output, *options, "-o", "RUN")
         job.begin("writing")
         if output is not None:

@@ -183,7 +183,7 @@ class LinearisedFit:
 
         With large residuals that error is unknown, and the candidate is taken to be as probable as the best one.
         """
-        if self.state.floor > 1.0:
+        if self.state.scatter > 1.0:
             return best
         return min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best)))
 
@@ -226,14 +226,14 @@ class LinearStep:
 
     def addition(self, name: str, sums: tuple[WeightedChanges, ...]) -> tuple[ClassMember, AnyVector]:
         """The addition itself as a member, with its fitted values, and its prior widths."""
-        fit, design, floor = self.laid.fit, self.laid.design, self.laid.state.floor
+        fit, design, scatter = self.laid.fit, self.laid.design, self.laid.state.scatter
         positions = fit.model.free[self.at]
         column = design.jacobian[:, self.at]
         column[design.rows :] = 0.0  # without its prior, which enters through the widths
         projected = self.projector(column)
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
-        evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / floor**2
+        evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / scatter**2
         return ClassMember(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
     def candidates(
@@ -253,7 +253,7 @@ class LinearStep:
             square = gram[at, at]
             if np.max(np.diag(square) * probe.widths**2, initial=0.0) < FAINTEST**2:
                 continue
-            evidence = log_bayes(square, scores[at], probe.widths) / state.floor**2
+            evidence = log_bayes(square, scores[at], probe.widths) / state.scatter**2
             scored.append((evidence, bool({probe.name, probe.effect.name} & set(alike)), probe))
         scored.sort(key=lambda item: -item[0])
         groups = [item for item in scored if item[2].effect is Described]
@@ -337,7 +337,7 @@ class LinearStep:
         laid, projected = self.laid, self.projector(column)
         square, along = projected.T @ projected, projected.T @ self.left
         if evidence is None:
-            evidence = log_bayes(square, along, widths) / laid.state.floor**2
+            evidence = log_bayes(square, along, widths) / laid.state.scatter**2
         covariance = np.linalg.inv(square + np.diag(widths**-2.0))
         amplitudes = -covariance @ along
         count = len(laid.fit.model.free)

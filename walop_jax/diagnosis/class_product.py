@@ -66,6 +66,9 @@ class ClassMember(NamedTuple):
 class ClassOf(NamedTuple):
     """An addition, and the members of its class, itself first.
 
+    Without an independent zero of the polariser `clp_zero` and `rotator_zero` are such a class: both turn the sky
+    against the polariser.
+
     `at` are the positions of its amplitudes among the free parameters. `spread` is the error of p of stars between
     members, `stated` that of the fit, medians over the field; `off` by how many errors of the product the farthest
     member lies from it, in the median of the field, the worst element.
@@ -86,6 +89,9 @@ class ClassOf(NamedTuple):
 
 class Shape(NamedTuple):
     """Changes that are in the errors of a product and not in its values; errors of p of stars: from them, from the fit.
+
+    A retardance was described as growing with r², and the data would hardly show a part that grows with r⁴: that part
+    is such a change, with the value 0 and an error.
 
     `moment` is E[c cᵀ] of their amplitudes c, `slopes` the change of the free parameters of the fit by each. Those at
     the positions `on_stars` act on starlight, and are in the product (`Deviations`).

@@ -238,7 +238,7 @@ def undetected(laid: LinearisedFit) -> Shape | None:
     tried = [block for place, block in blocks.items() if place != front or block.gram.any()]
     if not tried or front not in blocks:
         return None
-    moments = _second_moments(tried, laid.state.floor)
+    moments = _second_moments(tried, laid.state.scatter)
     factors = [  # of the covariance of the matrix, its columns in units of the standard errors
         _slopes(laid, block.sums, block.slopes) @ square_root(moment)
         for block, moment in zip(tried, moments, strict=True)
@@ -294,14 +294,16 @@ def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, pla
     )  # fmt: skip
 
 
-def _second_moments(blocks: Sequence[_Block], floor: float) -> list[AnyMatrix]:
-    """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `floor`."""
+def _second_moments(blocks: Sequence[_Block], scatter: float) -> list[AnyMatrix]:
+    """E[c cᵀ] of the amplitudes of every block, each group being there or not; evidence in units of `scatter`."""
     odds, moments = _odds(sum(len(block.groups) for block in blocks)), []
     for block in blocks:
         moment = np.zeros_like(block.gram)
         for group in block.groups:
             at = np.ix_(group, group)
-            moment[at] = _second_moment(block.gram[at], block.scores[group], block.widths[group], odds, floor)
+            moment[at] = _second_moment(
+                block.gram[at], block.scores[group], block.widths[group], odds, scatter
+            )
         moments.append(moment)
     return moments
 
@@ -313,12 +315,12 @@ def _odds(groups: int) -> float:
 
 
 def _second_moment(
-    gram: AnyMatrix, scores: AnyVector, widths: AnyVector, odds: float, floor: float
+    gram: AnyMatrix, scores: AnyVector, widths: AnyVector, odds: float, scatter: float
 ) -> AnyMatrix:
     """E[c cᵀ] of the amplitudes of a group, over its scales and its absence."""
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
     value, along = np.clip(value, 0.0, None), vector.T @ (scores * widths)
-    weight = special.softmax([*(odds + log_bayes_by_scale(value, along, SCALES) / floor**2), 0.0])[:-1]
+    weight = special.softmax([*(odds + log_bayes_by_scale(value, along, SCALES) / scatter**2), 0.0])[:-1]
     variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
     mean, vector = variance * along[:, None], widths[:, None] * vector
     return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
@@ -339,7 +341,7 @@ def _of_other_light(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
     covariance, odds = np.zeros((count, count)), _odds(len(absent))
     for probe in absent:
         at = places[probe.name]
-        moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.floor)
+        moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.scatter)
         covariance += slopes[:, at] @ moment @ slopes[:, at].T
     return square_root(covariance)
 

@@ -49,6 +49,9 @@ from walop_jax.model.specification import Model
 class Trial:
     """A trial addition to a model: its evidence (ln B), the remaining χ², and whether that agrees with noise.
 
+    Example: the effect `ghost`, expected by its linear step to have ln B = 41, fitted with ln B = 40.2, with χ² = 1360
+    left of 21000.
+
     item, expected   its linear step, and the evidence that a fit should find by it (None, NaN: it has none)
     fit              its fit; None until it has been fitted
     alternatives     other shapes of the effect that explain the data as well, in words
@@ -57,10 +60,10 @@ class Trial:
     predicts         False if its linear step does not predict held-out data
     compared         the fits without and with it (`refits.before_and_after`)
     against          KINDs of exposures that contradict it
-    refused          the reason for which it was not added
+    refused          the reason for which it was not added; empty while nothing speaks against it
     score, p_value   of the linear test at the time when it was added
     groups           groups of sentences added one after the other, each with the candidates that were as good then
-    also             other names (`synonyms`) of the trial, and of its `nameless` rivals
+    synonyms         other names (`synonyms.synonyms`) of the trial, and of its `nameless` rivals
     """
 
     effect: EffectKind
@@ -80,7 +83,7 @@ class Trial:
     against: str = ""
     refused: str = ""
     groups: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     probability: float = float("nan")
 
     @property

@@ -89,8 +89,8 @@ class Evidence:
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
     `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are reported as
     the effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
-    `dof` are those of the fit, `scale` the factor on the errors with which it was made. `also` are the other names of
-    candidates (`synonyms`).
+    `dof` are those of the fit, `scale` the factor on the errors with which it was made. `synonyms` are other
+    names of candidates (`synonyms.synonyms`).
     """
 
     space: ScoreSpace
@@ -104,7 +104,7 @@ class Evidence:
     chi2: float
     dof: int
     scale: float = 1.0
-    also: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     @property
     def smooth(self) -> SmoothFields | None:
@@ -168,7 +168,7 @@ class Evidence:
         return self.chi2 > thresholds.POOR_FIT * self.dof
 
     @property
-    def floor(self) -> float:
+    def scatter(self) -> float:
         """Scatter behind all candidates, in standard deviations of the data as stated; 1 or more.
 
         Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
@@ -177,7 +177,10 @@ class Evidence:
         return self.table.noise_scale if self.table.noise_scale > thresholds.FLOOR else 1.0
 
     def by_fit(self, score: Score) -> float:
-        """Difference of the evidence that a fit finds, with its errors, from that in units of the remaining noise."""
+        """What a fit of this candidate finds as ln B, less its ln B by the linear step.
+
+        Fits count in errors as stated, linear steps in units of the scatter behind all candidates (`noise_scale`).
+        """
         return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
 
     @cached_property
@@ -217,7 +220,7 @@ class Evidence:
         """Effects indistinguishable from a candidate, by linear steps; the nearest first."""
         apart = self.nearest(self.apart(item))
         apart.pop(item.effect.name, None)
-        close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.floor}
+        close = {name: s for name, s in apart.items() if s < thresholds.SEPARATION * self.scatter}
         return tuple(sorted(close, key=close.__getitem__))
 
     def classes(self) -> Iterator[dict[str, Any]]:
@@ -354,7 +357,7 @@ class Examination(Evidence):
         projected = rest(np.pad(change, (0, len(design.residual) - len(change))))
         scores = design.products(columns, design.projector(projected)) + along @ (basis.T @ projected)
         distances = self.nearest(separations(space, scores, float(projected @ projected)))
-        return {rival: apart / self.floor for rival, apart in distances.items()}
+        return {rival: apart / self.scatter for rival, apart in distances.items()}
 
     def is_like(self, design: Design) -> bool:
         """True if the expected counts of another fit are close enough to reuse its columns."""
@@ -377,7 +380,7 @@ def examine(
     again where the light has hardly changed.
     """
     active, design = result.model.effect_names, Design.of(result)
-    known = earlier.also if earlier is not None else {} if synonyms_apart else None
+    known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
     if earlier is not None and earlier.is_like(design):
         computed = earlier.candidates
     else:
@@ -431,7 +434,7 @@ def examine(
         candidates=candidates,
         bare=bare,
         fields=hypotheses.smooth,
-        also=known,
+        synonyms=known,
     )
 
 

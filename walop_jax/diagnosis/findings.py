@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
@@ -413,16 +414,27 @@ def of_diagnosis(fit: Verdict, left: Unexplained | None, subject: str, *, comple
     """The verdict on a diagnosis, given that on its fit and what is left over."""
     if complete:
         return fit.with_doubts((), subject=subject)
+    fit = dataclasses.replace(fit, doubts=tuple(map(_without_advice_to_diagnose, fit.doubts)))
     what = "something without a name is missing from the model" if left is None else left.description
-    off, cure = (
-        None,
-        "walop-jax report shows where it is; describe its cause with --effects, and diagnose again",
-    )
+    off, cure = None, f"{_SHOWS_WHERE}; describe its cause with --effects, and diagnose again"
     if left is not None and left.number:
         what, cure = f"{left.number} is wrong", "correct the number that the set states, and fit again"
     elif left is not None and math.isfinite(left.change_of_qu):
         off = left.change_of_qu
     return fit.with_doubts([Doubt(Quality(0), what, off=off, remedy=cure)], subject=subject)
+
+
+_SHOWS_WHERE = "walop-jax report shows where it is"
+
+
+def _without_advice_to_diagnose(doubt: Doubt) -> Doubt:
+    """A doubt about the fit of a diagnosis, without the advice to make a diagnosis: this is one."""
+    if not re.search(_ADVICE, f"{doubt.sentence} {doubt.cure}"):
+        return doubt
+    return dataclasses.replace(doubt, sentence=re.sub(_ADVICE, "", doubt.sentence), remedy=_SHOWS_WHERE)
+
+
+_ADVICE = r"(: | \(|; | )walop-jax diagnose looks for [a-z ]+\)?$"
 
 
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:

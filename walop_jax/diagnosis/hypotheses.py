@@ -39,6 +39,8 @@ class Probe:
     """One group of probes of an effect: the place in its shape space from which a linear step is taken.
 
     `context` are the data that its prior widths are for, `holders` effects of which a group of sentences is a part.
+    The effect `etalon` has a probe for each gap of air that is tried; its group holds two members, a quarter of a
+    fringe apart, whose amplitudes are those of a cosine and a sine.
     """
 
     name: str

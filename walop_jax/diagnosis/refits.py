@@ -171,7 +171,7 @@ class Refits:
         evidence, name = state.evidence, trial.effect.name
         result = settled(trial.fit, [name, *(step.effect.name for step in state.steps)])
         compared, alike = trial.compared, (*trial.rivals, *trial.nameless)
-        groups, also = {trial.name: alike} if trial.effect is Described else {}, trial.also
+        groups, synonyms = {trial.name: alike} if trial.effect is Described else {}, trial.synonyms
         probability = trial.probability
         if result is not trial.fit:
             compared = before_and_after(name, evidence.design, Design.of(result))
@@ -186,10 +186,10 @@ class Refits:
             compared = dataclasses.replace(
                 compared, **{key: getattr(earlier.compared, key) for key in before}
             )
-            groups, also = {**earlier.groups, **groups}, {**earlier.also, **also}
+            groups, synonyms = {**earlier.groups, **groups}, {**earlier.synonyms, **synonyms}
             probability = min(probability, earlier.probability)
         found = {
-            "compared": compared, "score": score, "p_value": p_value, "groups": groups, "also": also,
+            "compared": compared, "score": score, "p_value": p_value, "groups": groups, "synonyms": synonyms,
             "probability": probability,
         }  # fmt: skip
         step = dataclasses.replace(trial, **found)

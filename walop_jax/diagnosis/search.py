@@ -9,15 +9,16 @@
    a thing is confirmed, the next thing is tried, unless the first one is best described by a pattern: a weaker thing
    would then be fitted to a model that lacks the stronger one, and imitate it.
 
-All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `Judge` says
-what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps (`tests/diagnosis/linear_judge.py`).
+All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `TrialJudge`
+says what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps
+(`tests/diagnosis/linear_judge.py`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -73,18 +74,35 @@ class State:
     ended: str = ""
 
 
-Judge = Any
-"""Worth of an addition, by exact fits (`refits.Refits`) or by linear steps alone:
+@runtime_checkable
+class TrialJudge(Protocol):
+    """What an addition to a model is worth: by exact fits (`refits.Refits`), or by linear steps alone.
 
-over        amount of work after which nothing further is tried, in words; empty: there is more to spend
-fitted      a trial that has a linear step, with what the judge finds for it: Refits fits it exactly
-others      trials of effects without a linear step, and the other descriptions of the instrument that were compared
-confronted  a trial with its test against held-out data
-adopted     the state after a trial has joined the model
-"""
+    The evidence that it is given is the one that it put into its states: Refits works with an `Examination`.
+    """
+
+    def over(self, fits: int) -> str:
+        """Amount of work after which nothing further is tried, in words ("40 fits"); empty: there is more to spend."""
+        ...
+
+    def fitted(self, evidence: Any, trial: Trial) -> Trial:
+        """A trial that has a linear step, with what the judge finds for it: Refits fits it exactly."""
+        ...
+
+    def others(self, state: State) -> tuple[Sequence[Trial], Mapping[str, Choice]]:
+        """Trials of effects without a linear step, and the other descriptions of the instrument that were compared."""
+        ...
+
+    def confronted(self, evidence: Any, trial: Trial) -> Trial:
+        """A trial with its test against held-out data."""
+        ...
+
+    def adopted(self, state: State, trial: Trial) -> State:
+        """The state after a trial has joined the model."""
+        ...
 
 
-def search(state: State, judge: Judge) -> State:
+def search(state: State, judge: TrialJudge) -> State:
     """The state in which nothing is missing, or nothing more can be added."""
     for _ in range(thresholds.MOST_STEPS):
         if not state.evidence.alarm:
@@ -159,7 +177,7 @@ class _RoundInProgress:
     """
 
     state: State
-    judge: Judge
+    judge: TrialJudge
     posterior: MissingThings
     fits: int
     choices: Mapping[str, Choice]
@@ -167,7 +185,7 @@ class _RoundInProgress:
     others_asked: bool = False
 
     @classmethod
-    def of(cls, state: State, judge: Judge) -> _RoundInProgress:
+    def of(cls, state: State, judge: TrialJudge) -> _RoundInProgress:
         """The round of a state, in which nothing has been tried."""
         return cls(state, judge, most_probable(state.evidence), state.fits, state.choices)
 
@@ -201,7 +219,7 @@ class _RoundInProgress:
                 break
             self.fits += 1
             trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
-            worth = expected + (trial.evidence - trial.expected) / self.evidence.floor**2
+            worth = expected + (trial.evidence - trial.expected) / self.evidence.scatter**2
             if self.passes(trial) and not self._is_pattern(thing, trial, worth):
                 passed.append((worth, trial))
         return passed
@@ -235,7 +253,7 @@ class _RoundInProgress:
         self.others_asked = True
         trials, self.choices = self.judge.others(dataclasses.replace(self.state, fits=self.fits))
         self.fits += len(trials)
-        unit = self.evidence.floor**2
+        unit = self.evidence.scatter**2
         best = max(names, key=lambda pair: pair[1].evidence, default=None)
         level = 0.0 if best is None else best[0] - best[1].evidence / unit
         return [(level + trial.evidence / unit, trial) for trial in trials if self.passes(trial)]
@@ -279,7 +297,7 @@ class _RoundInProgress:
         return f"{best} is more probable: {thing.probabilities[best]:.2g}, and this {probability:.1g}"
 
 
-def _next(state: State, judge: Judge) -> tuple[Trial | None, State]:
+def _next(state: State, judge: TrialJudge) -> tuple[Trial | None, State]:
     """The most probable addition that nothing speaks against (None: there is none), and the state with the reasons."""
     turn, accepted = _RoundInProgress.of(state, judge), None
     things = list(turn.posterior.things)
@@ -336,6 +354,6 @@ def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: 
         trial,
         rivals=tuple(name for name in names if name in effects),
         nameless=nameless,
-        also={name: evidence.also[probe] for name, probe in probes.items() if probe in evidence.also},
+        synonyms={n: evidence.synonyms[probe] for n, probe in probes.items() if probe in evidence.synonyms},
         probability=float(np.exp(worth[trial.name] - np.logaddexp.reduce(list(logs.values())))),
     )

@@ -162,7 +162,7 @@ def diagnose(
         ended=state.ended or (judge.over(state.fits) if remainder else ""),
         members=_members(first, state, steps),
         rounds=state.rounds,
-        not_scored=_not_scored(catalogue, candidates, first.evidence.also),
+        not_scored=_not_scored(catalogue, candidates, first.evidence.synonyms),
         descriptions=len(candidates.sentences) + len(candidates.parts),
     )
     tables = first.evidence.table, evidence.table
@@ -251,7 +251,7 @@ def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step
         parameters=parameters,
         log_bayes=trial.evidence,
         nameless=trial.nameless,
-        also_called=trial.also,
+        also_called=trial.synonyms,
         about=_about(effect, result.model.template.cameras.names),
         probability=trial.probability,
         alternatives=trial.alternatives,

@@ -77,7 +77,7 @@ class Quadratic(Protocol):
 AnyQuadratic = TypeVar("AnyQuadratic", bound=Quadratic)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Minimum(Generic[AnyQuadratic]):
     """End of a search: `x` in the units it was given, the expansion there and the gates.
 
@@ -94,6 +94,10 @@ class Minimum(Generic[AnyQuadratic]):
     condition: float
     history: tuple[float, ...]
     starts: int = 1
+
+    def __repr__(self) -> str:
+        value = f"{self.expansion.objective:.7g}"
+        return f"Minimum {value} in {len(self.x)} parameters after {self.steps} steps: {self.message}"
 
     @property
     def converged(self) -> bool:

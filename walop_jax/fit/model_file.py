@@ -18,7 +18,7 @@ from walop_jax.model.effects.catalogue import entries, is_own
 from walop_jax.model.effects.in_models import effects_of, known_effects, with_effects
 from walop_jax.model.instrument import Instrument, adapted, as_designed, nominal_instrument
 from walop_jax.model.laws import laws_of
-from walop_jax.model.noise import noise_choices, with_noise
+from walop_jax.model.noise import TERMS, noise_choices, with_noise
 from walop_jax.model.parameters import Parameter, check_names, unknown_name
 from walop_jax.model.sources import Standards
 from walop_jax.model.specification import GAUGE, Model, make_model
@@ -147,7 +147,7 @@ def _header(
     for name, values in choices.items():
         if not isinstance(values, Mapping):
             raise ValueError(f"[effects] {name} = {values!r} must be a table, [effects.{name}]")
-    check_names("key of [noise]", noise, ("scale", "fraction"))
+    check_names("key of [noise]", noise, TERMS)
     for key, groups in noise.items():
         if not isinstance(groups, str) and not (
             isinstance(groups, list) and all(isinstance(group, str) for group in groups)

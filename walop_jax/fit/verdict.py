@@ -175,7 +175,7 @@ class UndetectedError(NamedTuple):
     measured: bool = True
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Hidden:
     """The systematic errors that the data would not show, each one by itself.
 
@@ -185,6 +185,9 @@ class Hidden:
 
     errors: tuple[UndetectedError, ...]
     changes: Float[np.ndarray, "s n"]
+
+    def __repr__(self) -> str:
+        return f"{len(self)} errors that the data would not show: {some([error.name for error in self.errors], 3)}"
 
     def __len__(self) -> int:
         return len(self.errors)

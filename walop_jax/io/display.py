@@ -112,11 +112,10 @@ def _cell(tag: str, text: str, column: str = "") -> str:
     return f'<{tag} style="text-align: {side}">{html.escape(text)}</{tag}>'
 
 
-class Displayed(abc.ABC):
-    """Something that shows itself as a short table instead of as everything that it holds.
+class ShortDir:
+    """Something whose `dir`, and with it the completion of names in a session, lists what a user may want.
 
-    `_working` are methods by which other rooms make and change it. They are no results: `dir` leaves them out, and with
-    it the completion of names in a session.
+    `_working` are the parts and methods by which other rooms make and change it: they are left out.
     """
 
     _working: ClassVar[tuple[str, ...]] = ()
@@ -124,6 +123,10 @@ class Displayed(abc.ABC):
     def __dir__(self) -> list[str]:
         working = {name for cls in type(self).__mro__ for name in vars(cls).get("_working", ())}
         return sorted(set(super().__dir__()) - working)
+
+
+class Displayed(ShortDir, abc.ABC):
+    """Something that shows itself as a short table instead of as everything that it holds."""
 
     @abc.abstractmethod
     def display(self) -> Display:

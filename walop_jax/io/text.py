@@ -64,8 +64,8 @@ def date_of(mjd: float) -> str:
 
 
 def with_minus_sign(text: str) -> str:
-    """A number with a true minus sign."""
-    return text.replace("-", "−")
+    """A number with a true minus sign; that of a power of ten stays as it is typed: −0.3, but 1.6e-05."""
+    return re.sub("(?<!e)-", "−", text)
 
 
 def rounded(value: float | None, form: str = ".4g") -> str:

@@ -104,5 +104,5 @@ def project_flux(
     """
     xp = namespace(columns)
     power = shared.summed(along**2)
-    share = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
-    return shared.independent(columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, share) * along)
+    component = shared.summed(columns * along) / xp.where(power > 0, power, 1.0)
+    return shared.independent(columns - xp.where(xp.asarray(flux_known)[..., None], 0.0, component) * along)

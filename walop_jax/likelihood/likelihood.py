@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.io.display import ShortDir
 from walop_jax.io.shapes import Matrix, Vector
 from walop_jax.likelihood import engine
 from walop_jax.likelihood.field_table import FieldTable, accurate_nodes
@@ -92,7 +93,7 @@ class OpticsUsed(NamedTuple):
     error: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Expansion:
     """χ² of data and priors at a point of parameter space, and its expansion there in the free parameters.
 
@@ -114,6 +115,10 @@ class Expansion:
     dof: int
     optics: OpticsUsed
     log_variance: float = 0.0
+
+    def __repr__(self) -> str:
+        sums = f"χ² = {self.data:.7g} of the data + {self.priors:.4g} of priors"
+        return f"Expansion: {sums}, {self.dof} degrees of freedom, {len(self.gradient)} free parameters"
 
     @property
     def chi2(self) -> float:
@@ -177,7 +182,7 @@ def prior_rows(model: Model) -> PriorRows:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Likelihood:
+class Likelihood(ShortDir):
     """The joint likelihood of one calibration set under one model.
 
     Field points are handled in batches of equal size (`likelihood/layout.py`), several of them at a time
@@ -192,6 +197,11 @@ class Likelihood:
     >>> residual.shape  # point, exposure, camera
     (29, 14, 4)
     """
+
+    _working = (
+        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "left", "nodes",
+        "points", "points_as_stated", "runner", "weak", "with_errors_at",
+    )  # fmt: skip
 
     layout: Layout
     points: MeasuredPoints

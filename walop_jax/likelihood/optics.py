@@ -105,9 +105,9 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
     change = jnp.zeros_like(rows)
     if not isinstance(tangents[0], SymbolicZero):
         # The part of every direction in the change of every row.
-        share = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
-        share = share.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
-        change = jnp.einsum("cr,cbrs->brs", share, slopes)
+        part = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
+        part = part.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
+        change = jnp.einsum("cr,cbrs->brs", part, slopes)
     if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
         steps = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
         change = change + jax.jvp(lambda *o: band_rows.fun(values, *o), tuple(inputs), steps)[1]

@@ -114,8 +114,8 @@ class Instrument(LightPath):
         ray = Ray.entering(
             jnp.asarray(x, float), jnp.asarray(y, float), (nodes, Conditions(jnp.zeros_like(nodes), planned))
         )
-        state = tuple(angles.get(prefix) for prefix in moving)
-        path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, moving, [state])
+        setting = tuple(angles.get(prefix) for prefix in moving)
+        path = fold.Fold.of(instrument.behind_polariser(), instrument.arms, ray, moving, [setting])
         ahead, *inside = path.in_first_setting()
         of_arm = []
         for behind in inside:

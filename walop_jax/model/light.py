@@ -36,7 +36,7 @@ from walop_jax.model.sources import ExposureArrays, PointIllumination, Source, t
 Rows = Float[Array, "b r 4"]  # band, row of an analyser, Stokes
 Vectors = Float[Array, "b k 4"]  # band, camera, Stokes
 Counts = Float[Array, "e k"]  # exposure, camera
-Shares = Float[Array, " k"]  # camera
+CameraFactors = Float[Array, " k"]  # camera
 FEW_BANDS = 3
 FEW_SETTINGS = 4  # up to this number band integrals are computed one by one
 BROAD = 0.05  # µm: equivalent width from which a filter is displaced by `LightPath.filter_shift`
@@ -125,7 +125,7 @@ def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Rows:
     wavelength = node_wavelengths(instrument, plan)
 
     def at(wavelength: Float[Array, " n"]) -> Float[Array, "c n r 4"]:
-        """Rows of the analysers at every node, in every state."""
+        """Rows of the analysers at every node, in every setting."""
         ray = Ray.entering(x, y, (wavelength, plan.conditions))
         leading, banded = divided(instrument)
         for element in leading:
@@ -141,7 +141,7 @@ def band_rows(instrument: LightPath, plan: Plan, x: Scalar, y: Scalar) -> Rows:
 def integrated(
     plan: Plan, weights: Float[Array, "b n"], rows: Float[Array, "*s c n r 4"]
 ) -> Float[Array, "*s b r 4"]:
-    """Sums over the nodes of every band, each in its own state."""
+    """Sums over the nodes of every band, each in its own setting."""
     sizes = {last - first for _, first, last in plan.settings}
     if len(sizes) == 1 and len(plan.settings) > FEW_SETTINGS:
         grouped = weights.reshape(len(plan.settings), *sizes, -1)
@@ -178,7 +178,9 @@ def is_dispersed(instrument: LightPath) -> bool:
     return any(arm.analyser.dispersion is not None for arm in instrument.arms)
 
 
-def camera_vectors(instrument: LightPath, rows: Rows, throughput: Shares, x: Scalar, y: Scalar) -> Vectors:
+def camera_vectors(
+    instrument: LightPath, rows: Rows, throughput: CameraFactors, x: Scalar, y: Scalar
+) -> Vectors:
     """Analysis vectors (band, camera, Stokes): counts = vector · Stokes for light of unit flux."""
     instrument = instrument.patched()
     beam_vectors = beams(instrument, rows) @ upstream(instrument, x, y)
@@ -187,13 +189,13 @@ def camera_vectors(instrument: LightPath, rows: Rows, throughput: Shares, x: Sca
 
 def beams(instrument: LightPath, rows: Rows) -> Vectors:
     """Rows (band, camera, 4) of the cameras: each beam adds the rows of its analyser with its weights."""
-    index, shares = _beams(instrument)
-    contributions = (shares[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
+    index, weights = _beams(instrument)
+    contributions = (weights[:, j, None] * rows[:, index[:, j]] for j in range(index.shape[1]))
     return functools.reduce(jnp.add, contributions)
 
 
 def behind_throughput(
-    instrument: LightPath, beams: Vectors, throughput: Shares, x: Scalar, y: Scalar
+    instrument: LightPath, beams: Vectors, throughput: CameraFactors, x: Scalar, y: Scalar
 ) -> Vectors:
     """Analysis vectors from the beams of an instrument without effects (`patched`): throughput, and mixing."""
     for component in instrument.cameras.transmission:
@@ -216,11 +218,11 @@ def _beams(instrument: LightPath) -> tuple[Int[np.ndarray, "k j"], Float[Array, 
             for start, a in zip(first, analysers, strict=False)
         ]
     )
-    shares = jnp.concatenate([analyser.beam_weights() for analyser in analysers])
+    weights = jnp.concatenate([analyser.beam_weights() for analyser in analysers])
     if is_dispersed(instrument):
         slopes = jnp.concatenate([analyser.beam_weights_of_slopes() for analyser in analysers])
-        index, shares = np.concatenate([index, first[-1] + index], 1), jnp.concatenate([shares, slopes], 1)
-    return index[order], shares if (order == np.arange(len(order))).all() else shares[order]
+        index, weights = np.concatenate([index, first[-1] + index], 1), jnp.concatenate([weights, slopes], 1)
+    return index[order], weights if (order == np.arange(len(order))).all() else weights[order]
 
 
 # ----------------------------------------------------------------------------------------- light and counts
@@ -304,7 +306,7 @@ def _turned(instrument: LightPath, illumination: PointIllumination) -> PointIllu
 def counts(
     instrument: LightPath,
     rows: Rows,
-    throughput: Shares,
+    throughput: CameraFactors,
     illumination: PointIllumination,
     band: Int[Array, " e"],
 ) -> Counts:

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 NOISE = "noise"
 """The part of an instrument that holds the terms."""
+TERMS = ("scale", "fraction")
+"""The terms of the errors, by the names of their parameters and of the keys of [noise] in a model file. Parameters are
+in this order."""
 COMMON = "noise.scale"
 """Name of the scale of all errors."""
 ALL = "all"

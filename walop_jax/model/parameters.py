@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.io.code import blank
 from walop_jax.io.errors import nearest
+from walop_jax.io.text import in_its_unit
 from walop_jax.model.compiled import array, float64
 
 PARAMETER = "walop_jax.parameter"
@@ -42,7 +43,7 @@ AnyComponent = TypeVar("AnyComponent", bound="Component")
 Result = TypeVar("Result")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Parameter:
     """One number of an instrument: its name, what is known of it beforehand, and whether a fit varies it.
 
@@ -54,6 +55,9 @@ class Parameter:
     A number is `declared` before it has a value. The mean of its prior is then relative to the value that comes: ±0.3
     about the measured angle. Its `scale` may be 0, and follows from the prior or the value. A `name` that is given
     replaces the name that the tree would give: `pupil.magnification` for the magnification of the element `pupil`.
+
+    >>> walop.base_model(calset)["pupil.magnification"]
+    Parameter pupil.magnification = 15.63, prior 15.63 ± 0.05, free: field-to-pupil magnification
     """
 
     name: str
@@ -67,6 +71,13 @@ class Parameter:
     loose: float | None = None
     tie: str | None = None
     part: str = ""
+
+    def __repr__(self) -> str:
+        value = in_its_unit(f"{self.start:.7g}", self.unit)
+        prior = "" if self.prior is None else f", prior {self.prior[0]:.7g} ± {self.prior[1]:.2g}"
+        return (
+            f"Parameter {self.name or '(declared)'} = {value}{prior}, {self.freedom or 'free'}: {self.about}"
+        )
 
     @property
     def width(self) -> float | None:

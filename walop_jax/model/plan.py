@@ -50,7 +50,7 @@ class Plan(eqx.Module):
     @property
     def positions(self) -> list[ElementPositions]:
         """Positions of the moving elements, one tuple for each setting."""
-        return [state for state, _, _ in self.settings]
+        return [positions for positions, _, _ in self.settings]
 
 
 def blank_exposures(instrument: LightPath, count: int) -> ExposureArrays:

@@ -279,12 +279,14 @@ def _plan(
     # The angles of all elements, then their turns during the exposure.
     places = [np.nan_to_num(settings.position(prefix), nan=-np.inf) for prefix in moving]
     turns = [settings.turns.get(prefix, np.zeros(count)) for prefix in moving]
-    states = _rows([*places, *turns], count)
+    positions = _rows([*places, *turns], count)
     planned = _rows([values[name] for name in names], count)
     followed = _rows([values[name] for name in smooth], count)
     teff = np.nan_to_num(settings.teff).tolist()
     of_filter = settings.filter.astype(str).tolist()
-    keys = list(zip(states, of_filter, planned, followed, teff, slope.tolist(), kinds.tolist(), strict=True))
+    keys = list(
+        zip(positions, of_filter, planned, followed, teff, slope.tolist(), kinds.tolist(), strict=True)
+    )
     bands = sorted(set(keys))
 
     curves = {name: filters[name] for name in sorted({name for _, name, *_ in bands})}
@@ -317,8 +319,8 @@ def _plan(
     for value, members in itertools.groupby(bands, key=lambda key: key[0]):
         first, last = last, last + len(list(members))
         pairs = zip(value[: len(moving)], value[len(moving) :], strict=True)
-        state = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
-        laid.append((state, first, last))
+        setting = tuple(None if np.isinf(at) else Turning(at, turn) if turn else at for at, turn in pairs)
+        laid.append((setting, first, last))
     plan = Plan(
         wavelength=array(nodes),
         conditions=Conditions(

@@ -13,7 +13,7 @@ Elements, fold, band integral and patches are those of the forward model, differ
 
 Method      The rows of the analysers are linear in the matrix M of every element: δrows = (rows behind it) δM
             (matrix ahead of it), and δM of all elements in the same numbers come from one derivative.
-Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c states, n nodes
+Symbols     s slots, g generators, t changes of numbers, b bands, k cameras, r rows, c settings, n nodes
 Limits      first order.
 """
 

@@ -76,7 +76,7 @@ def effect_figure(data: DiagnosisFigureData, number: int = 1, on: Canvas = PAGE)
     without, with_it = (f"without\n{c.effect}", f"with\n{c.effect}") if number else _MODELS
     rows = {
         without: c.field["BEFORE"],
-        c.effect or "explained": c.field["EXPLAINED"],
+        f"explained by\n{c.effect}" if c.effect else "explained": c.field["EXPLAINED"],
         with_it: c.field["AFTER"],
     }
     return residual_maps(data.points, rows, data.cameras, on)

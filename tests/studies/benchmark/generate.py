@@ -89,7 +89,7 @@ class Layout:
             inside = {
                 n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in asked.items()
             }
-            known = SimpleNamespace(candidates=inside, is_like=lambda design: True, also={})
+            known = SimpleNamespace(candidates=inside, is_like=lambda design: True, synonyms={})
             return examine(result, hypotheses, rng, known)  # type: ignore[arg-type]
 
         used = (one.intensities.block(0, len(one.points)).used for one in (fitted, whole))

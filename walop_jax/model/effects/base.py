@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from walop_jax.io.text import in_its_unit
 from walop_jax.model.conventions import CAMERAS, EXTINCTION, OF_WALOP, Units
 from walop_jax.model.effects.change import Change
 from walop_jax.model.instrument import Instrument
@@ -32,6 +33,8 @@ from walop_jax.model.parameters import (
     unknown_name,
 )
 from walop_jax.model.parameters import Scalar as Scalar
+
+MOST_PRINTED = 4  # values of one parameter
 
 
 class Context(NamedTuple):
@@ -67,6 +70,8 @@ class Effect(Component):
 
     >>> walop.effect_by_name("hwp1_axis").neutral(walop.ObservingPlan(grid=3).context()).name
     'hwp1_axis'
+    >>> walop.effect_by_name("hwp1_axis").of(walop.ObservingPlan(grid=3).context(), angle=0.3)
+    hwp1_axis(angle=0.3 deg)
     """
 
     name: ClassVar[str] = ""
@@ -80,6 +85,14 @@ class Effect(Component):
     reference: ClassVar[str] = ""
     said: ClassVar[tuple[str, ...]] = ()
     unlisted: ClassVar[str] = ""
+
+    def __repr__(self) -> str:
+        numbers = [
+            f"{name}={_in_print(getattr(self, name), declared.unit)}"
+            for name, declared in self.declarations().items()
+        ]
+        choices = [f"{name}={value!r}" for name, value in self.choices().items()]
+        return f"{self.name}({', '.join(numbers + choices)})"
 
     @abc.abstractmethod
     def patch(self, instrument: Instrument) -> Instrument:
@@ -212,6 +225,18 @@ class Effect(Component):
     def lacks(self, instrument: Instrument) -> str:
         """The part that the instrument lacks for the effect, in words; empty where it fits."""
         return _lacking(self, dataclasses.replace(instrument, effects=()))
+
+
+def _in_print(value: Any, unit: str) -> str:
+    """The value of a parameter with its unit; how many values, if there are more than a few."""
+    try:
+        numbers = np.ravel(np.asarray(value, float)).tolist()
+    except TypeError:  # traced by JAX, or a shape: there is no number yet
+        return "?"
+    few = len(numbers) <= MOST_PRINTED
+    return in_its_unit(
+        "/".join(f"{number:.4g}" for number in numbers) if few else f"{len(numbers)} values", unit
+    )
 
 
 @by_shapes
