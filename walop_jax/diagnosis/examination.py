@@ -320,8 +320,9 @@ def examine(
     """
     active, design = result.model.effect_names, Design.of(result)
     known = earlier.also if earlier is not None else {} if synonyms_apart else None
-    if earlier is not None and earlier.is_like(design):
-        computed = earlier.candidates
+    again = earlier if earlier is not None and earlier.is_like(design) else None
+    if again is not None:
+        computed = again.candidates
     else:
         other_names = set(itertools.chain(*(known or {}).values()))
         wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
@@ -333,17 +334,25 @@ def examine(
         for p in hypotheses.parts
         if p.name in computed
     ]
-    patterns = [
-        dataclasses.replace(item, columns=item.columns.astype(np.float32))
-        for item in map(design.measured.candidate, strata(design.measured))
-    ]
+    patterns = (
+        [computed[name] for name in again.patterns]
+        if again is not None
+        else [
+            dataclasses.replace(item, columns=item.columns.astype(np.float32))
+            for item in map(design.measured.candidate, strata(design.measured))
+        ]
+    )
     of_probes = [computed[probe.name] for probe in (*probes, *sentences, *parts)]
     candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
     names = list(candidates)
     widths, columns = zip(*((c.widths, c.columns) for c in candidates.values()), strict=True)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
-    bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
+    if again is not None and again.scale == scale:
+        along = design.products(columns, design.projector.basis).T
+        bare = again.bare.subset(names).behind(design.projector, along)
+    else:
+        bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
     if known is None:
         known = synonyms(design, bare, candidates, (*probes, *sentences))
         if said := set(itertools.chain(*known.values())):
