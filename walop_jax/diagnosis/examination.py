@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
@@ -243,10 +242,14 @@ def explains(chi2: float, dof: float) -> bool:
 
 
 def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
-    """Size below which an amplitude stays (`thresholds.LIMIT`), for a flat prior (positive when one-sided)."""
+    """Size below which an amplitude stays (`thresholds.LIMIT`), for a flat prior (positive when one-sided).
+
+    Quantiles of a normal distribution above 0, and of the size of a normal number, whose square follows χ'² of rank 1.
+    """
     if one_sided:
-        return float(scipy.stats.truncnorm.ppf(thresholds.LIMIT, -value / sigma, np.inf, value, sigma))
-    return float(scipy.stats.foldnorm.ppf(thresholds.LIMIT, abs(value) / sigma, scale=sigma))
+        above = np.log1p(-thresholds.LIMIT) + special.log_ndtr(value / sigma)
+        return float(value - sigma * special.ndtri_exp(above))
+    return float(sigma * np.sqrt(special.chndtrix(thresholds.LIMIT, 1.0, (value / sigma) ** 2)))
 
 
 # ----------------------------------------------------------------------------------------------- of one fit
