@@ -19,17 +19,6 @@ def test_pieces_make_the_whole(order, count, monkeypatch):
     np.testing.assert_array_equal(score.gram(columns), found)
 
 
-@pytest.mark.parametrize("exact", [0, 5, 12, 30])
-def test_columns_that_are_not_exact_take_part_in_single_precision(exact, monkeypatch):
-    monkeypatch.setattr(limits, "COLUMNS_TOGETHER", 7)
-    columns = np.random.default_rng(4).standard_normal((50, 30)) * 10.0 ** np.linspace(-3, 5, 30)
-    found, whole, length = score.gram(columns, exact), columns.T @ columns, np.linalg.norm(columns, axis=0)
-    off = np.abs(found - whole) / np.outer(length, length)
-    assert np.max(off[:exact, :exact], initial=0.0) < 1e-14
-    assert np.max(off) < 1e-6
-    assert (np.max(off) > 1e-9) == (exact < 30)
-
-
 @pytest.mark.parametrize("priors", [0, 6])
 def test_a_space_is_that_of_projected_columns(priors, monkeypatch):
     """Rows of priors, in which no candidate has a part, are behind the projection like all others."""
@@ -43,6 +32,31 @@ def test_a_space_is_that_of_projected_columns(priors, monkeypatch):
     left = whole - jacobian @ np.linalg.lstsq(jacobian, whole)[0]
     np.testing.assert_allclose(space.gram, left.T @ left, rtol=0, atol=1e-12)
     np.testing.assert_allclose(space.before, np.sum(whole**2, axis=0), rtol=1e-12)
+
+
+def test_a_space_behind_another_projection_is_that_of_columns_projected_anew():
+    """A base that has another parameter, and one whose columns have moved, for some of the candidates."""
+    rng = np.random.default_rng(8)
+    first = rng.standard_normal((60, 4))
+    second = np.hstack([first + 0.1 * rng.standard_normal(first.shape), rng.standard_normal((60, 1))])
+    base = rng.standard_normal((55, 6)).astype(np.float32)
+    columns = [base[:, :2], base[:, 2:3], base[:, [1]] * np.float32(3.0), base[:, 3:]]
+    widths = [np.ones(own.shape[1]) for own in columns]
+    space = score.ScoreSpace.projected(score.Projector(first), "abcd", widths, columns, exact=0)
+    kept = [columns[number] for number in (0, 2, 3)]
+    projector = score.Projector(second)
+    for jacobian in (first, second):  # one after the other: the second time from what the first time gave
+        projector = score.Projector(jacobian)
+        along = projector.basis[:55].T @ np.hstack(kept)
+        space = space.subset("acd").behind(projector, along)
+        whole = np.pad(np.hstack(kept).astype(float), ((0, 5), (0, 0)))
+        left = whole - jacobian @ np.linalg.lstsq(jacobian, whole)[0]
+        # Columns in single precision: a multiple is one to 10⁻⁷ of its length.
+        np.testing.assert_allclose(np.asarray(space.gram), left.T @ left, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(space.gram.diagonal(), np.sum(left**2, axis=0), rtol=1e-12)
+        for at in space.places().values():
+            np.testing.assert_allclose(space.gram[at, at], left[:, at].T @ left[:, at], rtol=0, atol=1e-12)
+        assert space.free == 60 - jacobian.shape[1]
 
 
 def test_multiples_of_a_column_are_multiplied_once(monkeypatch):

@@ -195,11 +195,76 @@ def test_one_scale_of_all_errors_is_that_of_the_scatter():
     assert gradient[0] == pytest.approx(0.0, abs=1e-8 * free)
     assert matrix[0, 0] ** -0.5 == pytest.approx(best / np.sqrt(2 * free), rel=1e-12)
     assert value == pytest.approx(free + 2.0 * free * np.log(best), rel=1e-12)
-    left = 1.0 - 7.0 / free
     noise = noise_at(groups, np.array([np.sqrt(chi2 / (free - 7))]))
     terms = terms_of(noise)
     ratio = np.asarray(variance_ratio(noise, terms, scene.counts, scene.weight))
     data = scene.counts, scene.weight, scene.residual(ratio)
-    assert noise_expansion(noise, terms, *data, FLUX_KNOWN, scene.shared, left).gradient[0] == pytest.approx(
-        0.0, abs=1e-8 * free
+    taken = np.where(used, np.random.default_rng(1).uniform(0.0, 1.0, used.shape), 0.0)
+    taken *= 7.0 / taken.sum()
+    gradient = noise_expansion(noise, terms, *data, FLUX_KNOWN, scene.shared, taken).gradient
+    assert gradient[0] == pytest.approx(0.0, abs=1e-8 * free)
+
+
+def test_other_parameters_take_up_some_data_more_than_others():
+    """Half the slope of ln |V| + ln |Xᵀ V⁻¹ X| + rᵀ V⁻¹ r, and tr (P V' P V')/4, by determinants and inverses.
+
+    X holds the fluxes and columns of other parameters that one camera determines (Harville 1977).
+    """
+    scene, groups = Scene(FluxGroups()), (("all",), ("all",))
+    rng, values, used = np.random.default_rng(6), np.array([1.3, 0.004]), scene.weight > 0
+    n, weight = int(used.sum()), scene.weight[used]
+    camera = np.broadcast_to(np.arange(4), used.shape)[used]
+    unit = np.zeros((n, len(scene.groups())))
+    place = np.full(used.shape, -1)
+    place[used] = np.arange(n)
+    for column, rows in enumerate(scene.groups()):
+        at = place[tuple(np.array(rows).T)]
+        unit[at, column] = scene.unit[used][at]
+    known = np.broadcast_to(FLUX_KNOWN[:, None], used.shape)[used]
+    unit = unit[:, ~np.array([known[column > 0].all() for column in unit.T])]
+    others = rng.standard_normal((n, 5)) * np.where(camera == 1, 1.0, 0.05)[:, None] / weight[:, None]
+    design, counts = np.hstack([unit, others]), scene.counts[used]
+
+    def variance(at: Float[np.ndarray, " t"]) -> Float[np.ndarray, " n"]:
+        return (at[0] / weight) ** 2 + (at[1] * counts) ** 2
+
+    def fitted(at: Float[np.ndarray, " t"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " c"]]:
+        root = np.sqrt(variance(at))
+        best = np.linalg.lstsq(
+            design / root[:, None], (counts - np.where(known, scene.unit[used], 0.0)) / root
+        )[0]
+        return np.where(known, scene.unit[used], 0.0) + design @ best, best
+
+    for _ in range(
+        20
+    ):  # data of which the other parameters explain nothing, so that the model is the light of fluxes
+        counts = counts - others @ fitted(values)[1][-5:]
+
+    def deviance(at: Float[np.ndarray, " t"]) -> float:
+        left = (counts - fitted(at)[0]) / np.sqrt(variance(at))
+        information = design.T @ (design / variance(at)[:, None])
+        return float(np.sum(np.log(variance(at))) + np.linalg.slogdet(information)[1] + left @ left)
+
+    sigma = np.sqrt(variance(values))
+    x = design / sigma[:, None]
+    projection = np.eye(n) - x @ np.linalg.solve(x.T @ x, x.T)
+    flux = unit / sigma[:, None]
+    of_flux = flux @ np.linalg.solve(flux.T @ flux, flux.T)
+    taken, cube, residual = (np.zeros(used.shape) for _ in range(3))
+    taken[used] = 1.0 - np.diag(of_flux) - np.diag(projection)
+    cube[used], residual[used] = counts, (counts - fitted(values)[0]) / sigma
+    noise = noise_at(groups, values)
+    found = noise_expansion(
+        noise, terms_of(noise), cube, scene.weight, residual, FLUX_KNOWN, scene.shared, taken
     )
+    for i, value in enumerate(values):
+        step = 1e-5 * value * np.eye(2)[i]
+        slope = (deviance(values + step) - deviance(values - step)) / (2.0 * step[i])
+        assert 2.0 * found.gradient[i] == pytest.approx(
+            slope, rel=1e-5, abs=1e-5 * np.abs(found.gradient).max()
+        )
+    alpha = np.stack([values[0] / weight**2, values[1] * counts**2]) / sigma**2
+    exact = 2.0 * np.einsum("ab,sa,tb->st", projection**2, alpha, alpha)
+    matrix = found.matrix - np.diag([0.0, max(found.gradient[1] / values[1], 0.0)])
+    scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    np.testing.assert_allclose(matrix / scale, exact / scale, atol=0.05)

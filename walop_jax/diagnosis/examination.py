@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy
 from scipy import special
 
 from walop_jax.data.records import CalibrationSet
@@ -263,10 +262,14 @@ def explains(chi2: float, dof: float) -> bool:
 
 
 def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:
-    """Size below which an amplitude stays (`thresholds.LIMIT`), for a flat prior (positive when one-sided)."""
+    """Size below which an amplitude stays (`thresholds.LIMIT`), for a flat prior (positive when one-sided).
+
+    Quantiles of a normal distribution above 0, and of the size of a normal number, whose square follows χ'² of rank 1.
+    """
     if one_sided:
-        return float(scipy.stats.truncnorm.ppf(thresholds.LIMIT, -value / sigma, np.inf, value, sigma))
-    return float(scipy.stats.foldnorm.ppf(thresholds.LIMIT, abs(value) / sigma, scale=sigma))
+        above = np.log1p(-thresholds.LIMIT) + special.log_ndtr(value / sigma)
+        return float(value - sigma * special.ndtri_exp(above))
+    return float(sigma * np.sqrt(special.chndtrix(thresholds.LIMIT, 1.0, (value / sigma) ** 2)))
 
 
 # ----------------------------------------------------------------------------------------------- of one fit
@@ -381,8 +384,9 @@ def examine(
     """
     active, design = result.model.effect_names, Design.of(result)
     known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
-    if earlier is not None and earlier.is_like(design):
-        computed = earlier.candidates
+    again = earlier if earlier is not None and earlier.is_like(design) else None
+    if again is not None:
+        computed = again.candidates
     else:
         other_names = set(itertools.chain(*(known or {}).values()))
         wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
@@ -394,17 +398,25 @@ def examine(
         for p in hypotheses.parts
         if p.name in computed
     ]
-    patterns = [
-        dataclasses.replace(item, columns=item.columns.astype(np.float32))
-        for item in map(design.measured.candidate, strata(design.measured))
-    ]
+    patterns = (
+        [computed[name] for name in again.patterns]
+        if again is not None
+        else [
+            dataclasses.replace(item, columns=item.columns.astype(np.float32))
+            for item in map(design.measured.candidate, strata(design.measured))
+        ]
+    )
     of_probes = [computed[probe.name] for probe in (*probes, *sentences, *parts)]
     candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
     names = list(candidates)
     widths, columns = zip(*((c.widths, c.columns) for c in candidates.values()), strict=True)
     exact = sum(len(probe.widths) for probe in probes)  # rivals may be the same to the last digit
     scale = result.noise_scale
-    bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
+    if again is not None and again.scale == scale:
+        along = design.products(columns, design.projector.basis).T
+        bare = again.bare.subset(names).behind(design.projector, along)
+    else:
+        bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
     if known is None:
         known = synonyms(design, bare, candidates, (*probes, *sentences))
         if said := set(itertools.chain(*known.values())):

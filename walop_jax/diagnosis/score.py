@@ -48,7 +48,7 @@ Reduction = Callable[[AnyVector, float], tuple[AnyVector, float]]
 
 ABSORBED = 1e-6  # surviving share of a column's square below which the base has swallowed it
 FAINTEST = 0.05  # standard deviations that a plausible amplitude must reach to be testable
-ROOT_TOLERANCE = 1e-6  # ten times what products in single precision leave
+ROOT_TOLERANCE = 1e-6  # far above what columns in single precision leave, far below a part that counts
 LEAST_REST = 0.1  # share of the degrees of freedom that must be left behind all candidates to tell the noise
 SCALES = np.array([1.0, 0.3, 0.1, 0.03])  # of the numbers of one effect, in widths of their priors
 SKETCHES = 6  # random sums of its entries that a column is recognised by
@@ -194,10 +194,10 @@ class ScoreSpace:
     ) -> ScoreSpace:
         """The space of candidates, from the columns of each ahead of the projection, in units of `scale`.
 
-        Rows beyond those of the columns, of priors, are 0. Products of different candidates beyond the first `exact`
-        amplitudes are taken in single precision: 10⁻⁷ of the lengths of two columns, where a part of 10⁻³ counts; of
-        those that are multiples of one another there one is multiplied (`Repeated`). The projected columns of all rows
-        are never there at once.
+        Rows beyond those of the columns, of priors, are 0. Of columns beyond the first `exact` that are multiples of
+        one another in single precision, one is multiplied (`Repeated`). Products are taken in double precision, though
+        columns may come in single: with products good to 10⁻⁷ the number of directions that all candidates span, and
+        with it the noise behind them, hangs on rounding. The projected columns of all rows are never there at once.
         """
         sizes = [block.shape[1] for block in columns]
         stop = np.cumsum([0, *sizes])
@@ -217,9 +217,9 @@ class ScoreSpace:
                 rows_of_block = block[rows].T
                 remainder[at, : rows_of_block.shape[1]] += rows_of_block / scale
                 square += remainder[at] @ remainder[at].T
-            _add_upper(products, remainder[distinct].T if len(distinct) < count else remainder.T, exact)
+            _add_upper(products, remainder[distinct].T if len(distinct) < count else remainder.T)
         _mirror(products)
-        gram = Repeated(products, number, factor, alone)
+        gram = Repeated(products, number, factor, alone, along)
         return cls(tuple(names), tuple(sizes), np.concatenate(widths), before, gram, projector.free)
 
     def places(self) -> dict[str, slice]:
@@ -235,7 +235,9 @@ class ScoreSpace:
     def subset(self, names: Sequence[str]) -> ScoreSpace:
         """The space of some of the candidates."""
         keep, sizes = self.chosen(names), dict(zip(self.names, self.sizes, strict=True))
-        counts, gram = tuple(sizes[name] for name in names), self.gram[np.ix_(keep, keep)]
+        counts = tuple(sizes[name] for name in names)
+        number = {name: k for k, name in enumerate(self.names)}
+        gram = _of_candidates(self.gram, [number[name] for name in names], keep)
         return ScoreSpace(tuple(names), counts, self.widths[keep], self.before[keep], gram, self.free)
 
     @functools.cached_property
@@ -278,6 +280,16 @@ class ScoreSpace:
     def with_known(self, along: AnyMatrix) -> ScoreSpace:
         """The space when directions that were taken out of the columns are in them again; `along` are their parts."""
         return dataclasses.replace(self, gram=Less.of(self.gram, -along, along))
+
+    def behind(self, projector: Projector, along: Float[np.ndarray, "q _"]) -> ScoreSpace:
+        """The space of the same columns behind another projection; `along` is QᵀC with the basis Q of that one.
+
+        Cᵀ(1 − QQᵀ)C = Cᵀ(1 − Q₀Q₀ᵀ)C + (Q₀ᵀC)ᵀ(Q₀ᵀC) − (QᵀC)ᵀ(QᵀC): the columns are not multiplied again.
+        """
+        first = self.gram.whole if isinstance(self.gram, Less) else self.gram
+        given, taken = first.along.T, along.T
+        gram = Less.of(first, np.hstack([taken, -given]), np.hstack([taken, given]))
+        return dataclasses.replace(self, gram=gram, free=projector.free)
 
     # ------------------------------------------------------------------------------------------ scores
 
@@ -346,8 +358,8 @@ class ScoreSpace:
 class Repeated:
     """The Gram matrix of columns of which some are multiples (`factor`) of a distinct one (`number`).
 
-    `distinct` are the products of those; `blocks` are the products of the columns of each candidate, in float64.
-    Indices are those of an array of numpy with two axes.
+    `distinct` are the products of those; `blocks` are the products of the columns of each candidate, in float64;
+    `along` is what was taken out of the columns, QᵀC. Indices are those of an array of numpy with two axes.
     """
 
     def __init__(
@@ -356,16 +368,30 @@ class Repeated:
         number: Int[np.ndarray, " _"],
         factor: AnyVector,
         blocks: Sequence[AnyMatrix],
+        along: Float[np.ndarray, "q _"],
     ) -> None:
-        self.distinct, self.number, self.factor = distinct, number, factor
+        self.along = along
+        self.distinct, self.number, self.factor, self._blocks = distinct, number, factor, list(blocks)
         sizes = np.array([len(block) for block in blocks], int)
         self._owner = np.repeat(np.arange(len(sizes)), sizes)
         self._in_blocks = np.concatenate([np.zeros(0), *map(np.ravel, blocks)])
         ends, squares = np.cumsum(sizes), np.cumsum(sizes**2)
         self._local = np.arange(len(number)) - (ends - sizes)[self._owner]
         self._row = (squares - sizes**2)[self._owner] + self._local * sizes[self._owner]
+        starts = (ends - sizes).tolist()
+        self._of_place = {pair: k for k, pair in enumerate(zip(starts, ends.tolist(), strict=True))}
+
+    def of_candidates(self, numbers: Sequence[int], at: Int[np.ndarray, " _"]) -> Repeated:
+        """The matrix of some candidates, whose columns are `at`; the products of distinct columns are not copied."""
+        blocks = [self._blocks[number] for number in numbers]
+        return Repeated(self.distinct, self.number[at], self.factor[at], blocks, self.along[:, at])
 
     def __getitem__(self, index: tuple[Any, Any]) -> Any:
+        first, second = index
+        if isinstance(first, slice) and isinstance(second, slice) and first == second:
+            number = self._of_place.get((first.start, first.stop))
+            if number is not None and first.step is None:
+                return self._blocks[number]
         rows, columns = (np.arange(len(self.number))[at] for at in index)
         if rows.ndim == 1 and columns.ndim == 1:
             rows, columns = np.ix_(rows, columns)
@@ -440,6 +466,13 @@ class Less:
     def diagonal(self) -> AnyVector:
         """Entries of the diagonal."""
         return self.whole.diagonal() - np.sum(self.left * self.right, axis=1)
+
+
+def _of_candidates(gram: Gram, numbers: Sequence[int], at: Int[np.ndarray, " _"]) -> Gram:
+    """The matrix of some candidates, whose columns are `at`."""
+    if isinstance(gram, Less):
+        return Less(_of_candidates(gram.whole, numbers, at), gram.left[at], gram.right[at])
+    return gram.of_candidates(numbers, at) if isinstance(gram, Repeated) else gram[np.ix_(at, at)]
 
 
 class Blocks:
@@ -567,25 +600,23 @@ def joined_in_batches(columns: Sequence[AnyMatrix]) -> Iterator[tuple[slice, Any
         yield slice(int(stop[numbers[0]]), int(stop[numbers[-1] + 1])), joined
 
 
-def gram(columns: Float[np.ndarray, "d n"], exact: int | None = None) -> Float[np.ndarray, "n n"]:
-    """CᵀC; in single precision where a column beyond the first `exact` takes part, if that is said."""
+def gram(columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
+    """CᵀC."""
     products = np.zeros((columns.shape[1], columns.shape[1]))
-    _add_upper(products, columns, exact)
+    _add_upper(products, columns)
     _mirror(products)
     return products
 
 
-def _add_upper(products: AnyMatrix, columns: Float[np.ndarray, "d n"], exact: int | None) -> None:
-    """Add CᵀC as in `gram`, piece by piece, to the pieces on and above the diagonal."""
+def _add_upper(products: AnyMatrix, columns: Float[np.ndarray, "d n"]) -> None:
+    """Add CᵀC, piece by piece, to the pieces on and above the diagonal."""
     count = columns.shape[1]
-    single = columns if exact is None or exact >= count else columns.astype(np.float32)
-    starts = {*range(0, count, limits.COLUMNS_TOGETHER), count, min(exact or 0, count)}
-    pieces = [slice(first, stop) for first, stop in itertools.pairwise(sorted(starts))]
+    starts = [*range(0, count, limits.COLUMNS_TOGETHER), count]
+    pieces = [slice(first, stop) for first, stop in itertools.pairwise(starts)]
 
     def product(pair: tuple[slice, slice]) -> None:
         first, second = pair
-        source = columns if exact is None or second.stop <= exact else single
-        products[first, second] += source[:, first].T @ source[:, second]
+        products[first, second] += columns[:, first].T @ columns[:, second]
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(product, itertools.combinations_with_replacement(pieces, 2)))

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from walop_jax.fit.minimise import MAXIMUM_STEPS, Minimum, minimise
 from walop_jax.io.errors import fail
@@ -32,6 +33,8 @@ OTHER_STEPS = 12  # of a start one order of retardance away
 MOST_ORDERS = 8  # times that fringes of air are tried some orders away from the best so far
 # Scaled gradient of a large set: 10⁻³ of a standard error is 10⁻⁶ in χ², and of a χ² of 10⁹ rounding leaves 10⁻⁷.
 LARGE_TOLERANCE = 1e-3
+ERROR_ROUNDS = 4  # searches for errors of the data, each with what the others of the one before take up
+SETTLED = 1e-2  # standard errors that they may move by in the last of them
 
 
 def free_scales(model: Model) -> Vector:
@@ -104,19 +107,48 @@ def with_errors_fitted(
     for i in at[: len(noise.scales)]:  # scales stand ahead of fractions
         if model.parameters[i].free:
             start[i] *= np.sqrt(expansion.misfit)
-    rows, select = likelihood.priors, model.selection()
-    known = np.zeros((len(first), len(first)))
-    known[rows.index, rows.index] = rows.width**-2
-    of_data = expansion.matrix - select.T @ known @ select
+    at_start, values, sought = likelihood, best.x, best
+    for _ in range(ERROR_ROUNDS):
+        taken = _taken_up(at_start, values, expansion)
+        live = dataclasses.replace(likelihood.with_errors_at(None), taken=taken)
+        label = "fit with errors of the data"
+        found = _search(live, label, model.full(start[model.free], start), noise_scale, expansion)
+        found = dataclasses.replace(found, starts=best.starts, steps=sought.steps + found.steps)
+        moved = (found.x - start)[model.free] * np.sqrt(np.diag(found.expansion.matrix))
+        if not found.converged or np.abs(moved[np.isin(model.free, at)]).max(initial=0.0) < SETTLED:
+            break
+        # What the other parameters take up of the data hangs on the errors, a little.
+        start, sought, values = found.x.copy(), found, found.x
+        at_start = likelihood.with_errors_at(values)
+        expansion = at_start.expand(values, noise_scale, expansion)
+    return found
+
+
+def _taken_up(likelihood: Likelihood, values: Vector, expansion: Expansion) -> Float[np.ndarray, "p e k"]:
+    """The part of every intensity that the parameters of the model take up, its errors held; `expansion` is there.
+
+    Of a set whose optics are interpolated all intensities have the mean: of so many data each is taken up by a
+    thousandth.
+    """
+    model, cameras = likelihood.model, likelihood.cameras
     unit = free_scales(model)
     inverse = np.linalg.pinv(expansion.matrix * np.outer(unit, unit), rcond=1e-15, hermitian=True)
-    taken_up = float(np.sum(inverse * of_data * np.outer(unit, unit)))
+    inverse *= np.outer(unit, unit)
+    used = likelihood.used
+    if not likelihood.layout.interpolated:
+        rows = likelihood.jacobian(values) / expansion.noise_scale
+        taken = np.zeros((*used.shape, cameras))
+        taken[used] = np.einsum("df,fg,dg->d", rows, inverse, rows, optimize=True).reshape(-1, cameras)
+        return taken
+    known, select = likelihood.priors, model.selection()
+    prior = np.zeros((len(values), len(values)))
+    prior[known.index, known.index] = known.width**-2
+    of_data = expansion.matrix - select.T @ prior @ select
     data = float(expansion.used_data.rows @ likelihood.data_per_row)
-    live = dataclasses.replace(likelihood.with_errors_at(None), left=1.0 - taken_up / max(data, 1.0))
-    found = _search(
-        live, "fit with errors of the data", model.full(start[model.free], start), noise_scale, expansion
+    mean = float(np.sum(inverse * of_data)) / max(data, 1.0)
+    return np.broadcast_to(
+        (mean * used * likelihood.data_per_row / cameras)[..., None], (*used.shape, cameras)
     )
-    return dataclasses.replace(found, starts=best.starts, steps=best.steps + found.steps)
 
 
 def find_minimum(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -191,7 +192,7 @@ class Likelihood(ShortDir):
 
     Errors of the data that have parameters (`model.noise`) are those of the values that a method is given, unless
     `errors_at` says at which values (a full vector) they are held: a fit hands on its likelihood with errors as fitted.
-    `left` is the fraction of the data that the other parameters leave for the errors (`noise`).
+    `taken` is the part of every intensity that the other parameters take up (`noise`), None: they take up none.
 
     >>> values, residual = result.likelihood.residuals(result.values)
     >>> residual.shape  # point, exposure, camera
@@ -208,7 +209,7 @@ class Likelihood(ShortDir):
     runner: Runner
     model: Model
     errors_at: Vector | None = None
-    left: float = 1.0
+    taken: Float[np.ndarray, "p e k"] | None = None
 
     def __repr__(self) -> str:
         names, free = len(self.model.names), len(self.model.free)
@@ -349,18 +350,21 @@ class Likelihood(ShortDir):
         instrument = self.model.instrument(values)
         nodes, optics = self.nodes(instrument, near)
 
-        def of_batch(data: engine.PointData) -> DataTerms:
+        def of_batch(data: engine.PointData, rows: slice) -> DataTerms:
             if self.fits_errors:
-                return self._terms_with_errors(instrument, data, nodes)
+                return self._terms_with_errors(instrument, data, nodes, rows)
             chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
             return DataTerms(float(chi2), gradient, matrix, self.counted(data))
 
         return self._joined("χ², gradient and matrix", of_batch), optics
 
     def _terms_with_errors(
-        self, instrument: Instrument, stated: engine.PointData, nodes: FieldTable | None
+        self, instrument: Instrument, stated: engine.PointData, nodes: FieldTable | None, rows: slice
     ) -> DataTerms:
-        """Terms of a batch of the data whose errors are those of the noise terms of the instrument."""
+        """Terms of a batch of the data whose errors are those of the noise terms of the instrument.
+
+        `rows` are the points of the batch, of which the last one may be filled up.
+        """
         noise, groups = instrument.noise, self.points.reader.noise_terms
         assert noise is not None
         counts, weight = np.asarray(stated.counts), np.asarray(stated.weight)
@@ -369,9 +373,11 @@ class Likelihood(ShortDir):
         chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
         residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
         shared = engine.flux_groups(instrument, self.plan)
-        of_errors = noise_expansion(
-            noise, groups, counts, weight, residual, self.flux_known, shared, self.left
-        )
+        taken = np.zeros(counts.shape)
+        if self.taken is not None:
+            own = self.taken[rows]
+            taken[: len(own)] = own
+        of_errors = noise_expansion(noise, groups, counts, weight, residual, self.flux_known, shared, taken)
         at, gradient, matrix = self.model.positions(NOISE), np.array(gradient), np.array(matrix)
         gradient[at] += of_errors.gradient
         matrix[np.ix_(at, at)] += of_errors.matrix
@@ -407,11 +413,18 @@ class Likelihood(ShortDir):
 
     # ----------------------------------------------------------------------------------- a pass over the points
 
-    def _joined(self, label: str, function: Callable[[engine.PointData], Joined]) -> Joined:
-        """The results of `function` for all batches of points, joined into one by their method `joined`."""
+    def _joined(self, label: str, function: Callable[[engine.PointData, slice], Joined]) -> Joined:
+        """The results of `function` for all batches of points, joined into one by their method `joined`.
+
+        It is given a batch, and the points of the set that the batch holds.
+        """
+        part, size = self.layout.part, self.layout.batch
 
         def work(number: int) -> Joined:
-            return functools.reduce(lambda a, b: a.joined(b), map(function, self.points.part(number)))
+            starts = itertools.count(number * part, size)
+            batches = zip(self.points.part(number), starts, strict=False)
+            results = (function(batch, slice(start, start + size)) for batch, start in batches)
+            return functools.reduce(lambda a, b: a.joined(b), results)
 
         parts = self.runner.each(label, work, self.layout.points, self.layout.part)
         return functools.reduce(lambda a, b: a.joined(b), parts)
@@ -430,7 +443,7 @@ class Likelihood(ShortDir):
 
         An expansion has counted them on its way (`Expansion.used_data`).
         """
-        return self._joined("counting", self.counted)
+        return self._joined("counting", lambda data, _: self.counted(data))
 
     @property
     def independent(self) -> int:

@@ -2,19 +2,23 @@
 
 Equations   −2 ln L = Σ r² + Σ ln ρ + Σ_F ln (Σ a² / Σ ρ a²),     r = (N − F u)/σ,   ρ = σ²/N_ERR²,   a = u/σ
             of a parameter v of the errors, with α = ∂ ln σ/∂v and ê² = a²/Σ a² the part of the flux in a datum:
-                half the gradient            −Σ r² α + c Σ (1 − ê²) α
-                half the expected Hessian     2 c [Σ (1 − 2 ê²) α αᵀ + Σ_F (Σ ê² α) (Σ ê² α)ᵀ], and for a fraction f the
-                                              slope over f as well where that is positive: only f² enters
+                half the gradient            −Σ r² α + Σ (1 − ê² − h) α
+                half the expected Hessian     2 [Σ (1 − 2 ê²) β βᵀ + Σ_F (Σ ê² β) (Σ ê² β)ᵀ], β = α √(1 − h/(1 − ê²)),
+                                              and for a fraction f the slope over f as well where that is positive:
+                                              only f² enters
 Symbols     N ± N_ERR a measured intensity, u the model for light of unit flux, F the flux, one for the intensities of a
             group (`flux.FluxGroups`); sums over F run over these groups; where F is known there is none, and ê = 0
-            c  the fraction of the data that the other parameters leave (1: none of them takes up any)
+            h  the part of a datum that the other parameters take up, x M⁻¹ xᵀ with x its row of the Jacobian in errors
+               and M the matrix of all (0: they take up none)
 Meaning     The third term is what a flat prior on F leaves when F is integrated out. Without it s would come out too
             small by √(3/4) for four cameras with one flux: each flux takes up one datum. The same is true of all other
-            parameters together, which take up p of n data: a fit puts c = 1 − p/n, a sampler, which draws them, c = 1.
+            parameters together, which take up p of n data, some more than others: a fit, which has their best values,
+            puts Σ (1 − h) ln ρ for the second term; a sampler, which draws them, h = 0.
 Sources     restricted maximum likelihood: Patterson & Thompson 1971, Biometrika 58, 545; Harville 1977, JASA 72, 320
 Limits      one scale s for all: s² = χ²/(n − n_F − p), the error of s is s/√(2 (n − n_F − p)).
-            c is the same for all data, although some fix the other parameters more than others do. The expected Hessian
-            has no terms between errors and other parameters: they are zero for symmetric noise.
+            The expected Hessian has no terms between errors and other parameters: they are zero for symmetric noise.
+            Of products of data with each other it has the sums that the projection on what is left fixes,
+            Σ_b Q_ab² = Q_aa = 1 − ê² − h, each at its own α.
 """
 
 from __future__ import annotations
@@ -107,26 +111,27 @@ def noise_expansion(
     residual: Float[np.ndarray, "p e k"],
     flux_known: Bool[np.ndarray, " e"],
     shared: FluxGroups = ALONE,
-    left: float = 1.0,
+    taken: Float[np.ndarray, "p e k"] | float = 0.0,
 ) -> NoiseExpansion:
-    """The expansion at residuals r = (N − F u)/σ; `weight` is 1/N_ERR, `left` the c of the head of this file."""
+    """The expansion at residuals r = (N − F u)/σ; `weight` is 1/N_ERR, `taken` the h of the head of this file."""
     ratio = variance_ratio(noise, terms, counts, weight)
     modelled = weight / np.sqrt(ratio)
     used = weight > 0
     light = np.where(used, counts * modelled - residual, 0.0)  # F u / σ
     part, _ = _parts(light, flux_known, shared)
     slopes = _slopes(noise, terms, counts * weight, ratio) * used
-    mean = np.stack([shared.summed(part * slope) for slope in slopes]) if len(slopes) else slopes
-    gradient = np.sum((left * (1.0 - part) - residual**2) * slopes, axis=(1, 2, 3))
-    matrix = np.einsum("pek,spek,tpek->st", 1.0 - 2.0 * part, slopes, slopes, optimize=True)
-    matrix += np.einsum("pek,spek,tpek->st", part, *2 * (np.broadcast_to(mean, slopes.shape),), optimize=True)
-    matrix *= 2.0 * left
+    gradient = np.sum((1.0 - part - taken - residual**2) * slopes, axis=(1, 2, 3))
+    own = slopes * np.sqrt(np.clip(1.0 - taken / np.where(part < 1.0, 1.0 - part, 1.0), 0.0, None))
+    mean = np.stack([shared.summed(part * slope) for slope in own]) if len(own) else own
+    matrix = np.einsum("pek,spek,tpek->st", 1.0 - 2.0 * part, own, own, optimize=True)
+    matrix += np.einsum("pek,spek,tpek->st", part, *2 * (np.broadcast_to(mean, own.shape),), optimize=True)
+    matrix *= 2.0
     # Only f² enters: near f = 0 the slope is f times a number, which is the curvature that the expectation lacks.
     of_fraction = np.arange(len(slopes)) >= len(terms.scale)
     values = np.concatenate([np.asarray(noise.scale), np.asarray(noise.fraction)])
     bent = gradient / np.where(values != 0.0, values, 1.0)
     matrix += np.diag(np.where(of_fraction & (values != 0.0), np.maximum(bent, 0.0), 0.0))
-    value = left * float(np.sum(log_variance(ratio, light, flux_known, shared)))
+    value = float(np.sum(log_variance(ratio, light, flux_known, shared)) - np.sum(taken * np.log(ratio)))
     return NoiseExpansion(value, gradient, matrix)
 
 
