@@ -185,7 +185,7 @@ class Step(FitComparison):
     `robust_ratio` are the errors of its parameters when every exposure may have a disturbance of its own, over the
     errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same effect
     that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
-    is the distance (σ) of each rival from it. `descriptions` are the sentences of an effect without a name
+    is the distance (σ) of each rival from it. `descriptions` are those of an effect without a name
     (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
     `also_called` are other names of it and of those, by name (`synonyms`). `about` is the effect in words with its
     place, `probability` that of its name among all names of the list, given that one of them is true (NaN: unknown).
@@ -220,7 +220,7 @@ class Step(FitComparison):
         likely = "above 0.99" if self.probability > 0.99 else f"{self.probability:.2g}"
         known = [f"probability {likely}"] if math.isfinite(self.probability) else []
         if self.descriptions:
-            words = " and ".join(_sentence(*entry)["words"] for entry in self.descriptions)
+            words = " and ".join(_described(*entry)["words"] for entry in self.descriptions)
             return f"{words} ({known[0]})" if known else words
         if change := self.choices.get("change", ""):
             return f"{change} ({self.effect})"
@@ -438,7 +438,7 @@ _ADVICE = r"(: | \(|; | )walop-jax diagnose looks for [a-z ]+\)?$"
 
 
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
-    """The sentences of a fitted model, each with its amplitude and standard error."""
+    """The descriptions of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
         return ()
     effect = result.model.instrument(result.values).effect(Described.name)
@@ -451,7 +451,7 @@ def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...
     )
 
 
-def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
+def _described(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
     unit = Described.numbers()[change.parameter].unit
     value, error = value_and_error(amplitude, sigma)
     kind, *dependence = change.in_words().split(", ")
@@ -480,7 +480,7 @@ def _step(step: Step) -> dict[str, Any]:
     near = sorted(step.separation.items(), key=lambda s: s[1])
     return {name: getattr(step, name) for name in _AS_THEY_ARE} | {
         "parameters": {n: {"value": v, "sigma": s, "unit": unit} for n, (v, s, unit) in entries.items()},
-        "sentences": [_sentence(*entry) for entry in step.descriptions],
+        "sentences": [_described(*entry) for entry in step.descriptions],
         "change_of_qu": step.change_of_qu,
         "robust_error_ratio": step.robust_ratio,
         "separation_sigma": {name: value for name, value in near if math.isfinite(value)},
