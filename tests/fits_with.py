@@ -35,6 +35,8 @@ def fit_with(calset: CalibrationSet, *effects: str | Effect) -> FitResult:
 def examined_with(result: FitResult, chosen: Callable[[str], bool] | None = None) -> Examination:
     """The residuals of a fit, asked for those sentences of its grammar whose names are chosen, or for none."""
     calset = result.calset
-    every = grammar.sentences(result.model.template, calset.exposures, len(calset.points)) if chosen else []
+    every = (
+        grammar.descriptions(result.model.template, calset.exposures, len(calset.points)) if chosen else []
+    )
     some = [probe for probe in every if chosen and chosen(probe.name)]
-    return examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
+    return examine(result, Hypotheses(descriptions=some), np.random.default_rng(0))

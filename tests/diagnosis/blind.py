@@ -5,7 +5,7 @@ thousand dimensions; what lies outside is pure noise. Scenes are drawn there: Ga
 signal-to-noise ratio behind the projection. They go through the search that `diagnose` runs (`diagnosis.search`), with
 its judge by linear steps in the place of the one that fits.
 Verdicts are written before the truths are opened. In some scenes the effect that is hidden is taken out of the
-catalogue: then the sentences that it is are asked for (`EFFECTS`, `in_sentences`), and no other name.
+catalogue: then the sentences that it is are asked for (`EFFECTS`, `as_descriptions`), and no other name.
 
     PYTHONPATH=tests python tests/diagnosis/blind.py [scenes per effect and ratio] [OUT.json] [processes]
 """
@@ -32,7 +32,7 @@ from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import LIGHT, SINGLE_EXPOSURES, Measured
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.examination import Evidence, Examination, common_mode, examine
-from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, sentences_of
+from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, Ranked, probes, texts_of
 from walop_jax.diagnosis.score import ScoreSpace, separations
 from walop_jax.diagnosis.search import State, search
 from walop_jax.fit.base_model import base_model
@@ -205,13 +205,13 @@ class Blind:
         self.rng = np.random.default_rng(seed)
         wanted = list(probes(EFFECTS, effect_context(model.template, calset.exposures)))
         self.context, self.template = effect_context(model.template, calset.exposures), model.template
-        every = grammar.sentences(model.template, calset.exposures, len(calset.points))
+        every = grammar.descriptions(model.template, calset.exposures, len(calset.points))
         examination = examined(result, Hypotheses(wanted, every), self.rng)
-        self.sentences = examination.sentences
+        self.descriptions = examination.descriptions
         self.probes = list(examination.probes)
-        self.in_sentences = {p.name: set(p.group[0].in_sentences(model.template)) for p in self.probes}
-        texts = [text for probe in self.sentences for text in sentences_of(probe)]
-        self.in_sentences |= {name: truth_of(name, texts) for name in OUTSIDE}
+        self.as_descriptions = {p.name: set(p.group[0].as_descriptions(model.template)) for p in self.probes}
+        texts = [text for probe in self.descriptions for text in texts_of(probe)]
+        self.as_descriptions |= {name: truth_of(name, texts) for name in OUTSIDE}
         self.effect_of = {p.name: p.effect.name for p in self.probes}
         self.space = examination.bare
         self.places = self.space.places()
@@ -222,9 +222,9 @@ class Blind:
         self.outside = {}
         self.said = {
             text: column
-            for probe in self.sentences
+            for probe in self.descriptions
             for text, column in zip(
-                sentences_of(probe), examination.candidates[probe.name].columns.T, strict=True
+                texts_of(probe), examination.candidates[probe.name].columns.T, strict=True
             )
         }
         for name, shape in outside(examination.design.measured, self.said):
@@ -232,7 +232,7 @@ class Blind:
             products = examination.design.products(examination.columns, column)
             along = self._whitening.T @ products
             self.outside[name] = along, max(float(column @ column - along @ along), 0.0)
-        explained = {*self.effect_of, *(probe.name for probe in self.sentences)}
+        explained = {*self.effect_of, *(probe.name for probe in self.descriptions)}
         self.patterns = [name for name in self.space.names if name not in explained]
         widths = common_mode(self.space, examination.design)
         self._behind_nuisance, self._reduce = self.space.with_base([SINGLE_EXPOSURES], widths)
@@ -313,13 +313,13 @@ class Blind:
         """What is asked of a scene, without what is not in the catalogue; the residuals are those of the design."""
         catalogue = [effect for effect in EFFECTS if effect.name not in removed]
         names = [p for p in self.probes if p.effect.name not in removed]
-        said, parts = grammar.beside_names(self.sentences, catalogue, self.context, self.template)
+        said, parts = grammar.beside_names(self.descriptions, catalogue, self.context, self.template)
         asked = [*(p.name for p in (*names, *said, *parts)), *self.patterns]
         space = self._behind_nuisance.subset(asked)
         if not removed:
             self._smallest = space.smallest_p(np.random.default_rng(7), DRAWS)
         return dataclasses.replace(
-            self.evidence, space=space, probes=names, sentences=said, parts=parts, patterns=self.patterns
+            self.evidence, space=space, probes=names, descriptions=said, parts=parts, patterns=self.patterns
         )
 
     def start(self, scene: Scene) -> Evidence:
@@ -447,7 +447,7 @@ def study(
     judged = verdicts(blind, opened, processes)
     if _seal(opened) != sealed:
         raise RuntimeError("the truths changed while the verdicts were made")
-    return summarise(list(zip(opened, judged, strict=True)), blind.in_sentences)
+    return summarise(list(zip(opened, judged, strict=True)), blind.as_descriptions)
 
 
 def _seal(scenes: Sequence[Scene]) -> bytes:

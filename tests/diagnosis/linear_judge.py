@@ -53,7 +53,7 @@ def joined(evidence: Evidence, item: Ranked, known: ScoreSpace | None = None) ->
         square=square,
         table=space.table_after(evidence.table, scores),
         probes=[p for p in evidence.probes if p.effect is not effect or effect is Described],
-        sentences=[probe for probe in evidence.sentences if probe is not item.probe],
+        descriptions=[probe for probe in evidence.descriptions if probe is not item.probe],
         parts=[dataclasses.replace(p, holders=p.holders - {effect}) for p in evidence.parts],
         chi2=evidence.chi2 - item.score.statistic * (evidence.table.noise_scale * evidence.scale) ** 2,
         dof=evidence.dof - item.score.rank,

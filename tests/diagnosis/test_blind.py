@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import orth
 
-from walop_jax.diagnosis.hypotheses import sentences_of
+from walop_jax.diagnosis.hypotheses import texts_of
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -25,7 +25,7 @@ def test_shapes_are_what_their_sentences_say(blind):
     for name, shape in suite.outside(design.measured, said):
         column = design.projector(design.stacked([shape[:, None]])[:, 0])
         texts = suite.truth_of(name, said)
-        groups = [probe.name for probe in blind.sentences if texts & set(sentences_of(probe))]
+        groups = [probe.name for probe in blind.descriptions if texts & set(texts_of(probe))]
         whole = [said[text][:, None] for text in suite.OUTSIDE[name] if text in said]
         some = [
             *(blind.evidence.candidates[group].columns for group in groups),

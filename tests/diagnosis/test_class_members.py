@@ -164,7 +164,7 @@ def turned():
 
 def test_a_change_of_one_name_is_not_shared_with_a_longer_description_of_it(turned):
     """The axes of both plates say all that the name says, and one number more, which is zero: 0.06° is one change."""
-    asked = {probe.name for probe in turned.sentences}
+    asked = {probe.name for probe in turned.descriptions}
     assert "axis of half1.plate; axis of half2.plate" in asked
     fit = turned.result
     value, error = fit.value("hwp2_axis.angle")
@@ -215,7 +215,7 @@ def test_a_member_whose_amplitude_is_beyond_its_prior_is_no_explanation():
     calset = set_with(4, {leak: 1e-3})
     result = fit_with(calset, Described.saying([leak], [1e-3]))
     state = examined_with(result, (leak, rival).__contains__)
-    assert {leak, rival} <= {probe.name for probe in state.sentences}
+    assert {leak, rival} <= {probe.name for probe in state.descriptions}
     classes = ambiguities(state, {leak: [rival]})
     assert [m.name for added in classes.additions for m in added.members] == []
     alone = Calibration.from_fit(result.with_verdict())

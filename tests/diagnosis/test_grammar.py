@@ -12,7 +12,7 @@ from scipy import stats
 from walop_jax.data.records import Position
 from walop_jax.diagnosis import grammar, thresholds
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, sentences_of
+from walop_jax.diagnosis.hypotheses import all_candidates, applicable, probes, texts_of
 from walop_jax.diagnosis.score import ScoreSpace, ScoreTable
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
@@ -88,7 +88,7 @@ def laid():
 @pytest.fixture(scope="module")
 def said(laid, request):
     """Columns of some listed groups; of all that there are where there is time."""
-    found = grammar.sentences(laid.model.template, laid.calset.exposures, len(laid.calset.points))
+    found = grammar.descriptions(laid.model.template, laid.calset.exposures, len(laid.calset.points))
     if not request.config.getoption("--long"):
         found = [probe for probe in found if probe.name in QUICK]
         assert len(found) == len(QUICK)
@@ -101,7 +101,7 @@ def test_names_are_sentences(laid, said):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
     wanted = list(probes(applicable(EFFECTS, context, template), context))
-    wanted = [p for p in wanted if p.group[0].in_sentences(template)]
+    wanted = [p for p in wanted if p.group[0].as_descriptions(template)]
     assert len({p.effect for p in wanted}) == 29
     single = {}
     for name, columns in said.items():
@@ -111,7 +111,7 @@ def test_names_are_sentences(laid, said):
         "wide gaps, blurred by the bands"
     )
     for probe in (p for p in wanted if p.name in theirs):
-        texts = [text for text in probe.group[0].in_sentences(template) if text in single]
+        texts = [text for text in probe.group[0].as_descriptions(template) if text in single]
         if not texts:
             assert "chwp" in probe.effect.name, "of the calibration plate, which is never in"
             continue
@@ -126,7 +126,7 @@ def test_names_are_sentences(laid, said):
 def test_sentences_that_have_a_name_are_left_to_it(laid):
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    every = grammar.descriptions(template, laid.calset.exposures, len(laid.calset.points))
     left = {p.name for p in grammar.beside_names(every, EFFECTS, context, template)[0]}
     gone = {p.name for p in every} - left
     assert "turn of polariser" in gone
@@ -140,7 +140,7 @@ def test_parts_of_effects_stand_for_them(laid):
     """One Moon patch of all, the light in one camera of four: no sentences of their own, but no longer than one."""
     template = laid.model.template
     context = effect_context(template, laid.calset.exposures)
-    every = grammar.sentences(template, laid.calset.exposures, len(laid.calset.points))
+    every = grammar.descriptions(template, laid.calset.exposures, len(laid.calset.points))
     found = {
         p.name: {e.name for e in p.holders}
         for p in grammar.beside_names(every, EFFECTS, context, template)[1]
@@ -162,7 +162,7 @@ def test_grammar_of_another_instrument():
     instrument = build(parsed(OWN, "own.toml"))
     window = Position(np.ones(5, bool), np.array([0.0, 10.0, 20.0, 40.0, 80.0]))
     exposures = builders.exposures(*turns).placed(WIN=window)
-    said = {p.name for p in grammar.sentences(instrument, exposures, 25)}
+    said = {p.name for p in grammar.descriptions(instrument, exposures, 25)}
     assert "retardance q behind window; retardance u behind window" in said
     assert "depolarisation of window * cos 2 WIN; depolarisation of window * sin 2 WIN" in said
     assert "axis of main.plate.second" in said
@@ -180,11 +180,11 @@ def test_every_description_can_be_made(name):
     instrument = nominal_instrument(name)
     exposures = dataclasses.replace(TURNING, instrument=name).exposures()
     # EXPTIME by KIND alone is no more than the KIND.
-    assert not any("EXPTIME" in probe.name for probe in grammar.sentences(instrument, exposures, 20))
+    assert not any("EXPTIME" in probe.name for probe in grammar.descriptions(instrument, exposures, 20))
     exposures = dataclasses.replace(exposures, exptime=30.0 + 30.0 * (np.arange(len(exposures)) % 2))
-    every = grammar.sentences(instrument, exposures, 20)
+    every = grammar.descriptions(instrument, exposures, 20)
     for probe in every:
-        for text in sentences_of(probe):
+        for text in texts_of(probe):
             Change.parsed(text).check_factors(instrument)
     assert {*COMBINED, *ALSO} <= {probe.name for probe in every}
 
@@ -194,7 +194,7 @@ def turning():
     """A fit whose residuals are noise, columns of all descriptions, and their space."""
     calset = simulate(TURNING, seed=5).calset
     design = Design.of(fit(Likelihood.of(calset, base_model(calset))))
-    every = grammar.sentences(design.fit.model.template, calset.exposures, len(calset.points))
+    every = grammar.descriptions(design.fit.model.template, calset.exposures, len(calset.points))
     made = all_candidates(design.columns, every).values()
     columns = [candidate.columns for candidate in made]
     names, widths = [candidate.name for candidate in made], [candidate.widths for candidate in made]
@@ -230,7 +230,8 @@ def test_the_time_since_the_beginning_of_a_night_is_asked_of_several_nights(seco
         )
     )
     said = [
-        p.group[0].sentences[0] for p in grammar.sentences(nominal_instrument("WALOP-SOUTH"), exposures, 25)
+        p.group[0].sentences[0]
+        for p in grammar.descriptions(nominal_instrument("WALOP-SOUTH"), exposures, 25)
     ]
     assert ("added polarisation q ahead of polariser * night hours" in said) == asked
 
@@ -244,7 +245,7 @@ def test_steps_part_the_exposures_evenly_and_are_dated_between():
     many = builders.exposures(
         *({"mjd": 61000.0 + hour / 24.0, "clp_angle": 3.0 * hour} for hour in range(65))
     )
-    said = [p.group[0].sentences[0] for p in grammar.sentences(instrument, many, 25)]
+    said = [p.group[0].sentences[0] for p in grammar.descriptions(instrument, many, 25)]
     steps = [text for text in said if text.startswith("axis of half1.plate * hours ") and " to " in text]
     assert len(steps) == 16
     assert (steps[0], steps[-1]) == (

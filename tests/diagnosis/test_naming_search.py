@@ -41,7 +41,7 @@ def evidence(amplitudes, seed=1, shared=SHARED, pattern_like=0.0):
         square=square,
         table=space.table(scores, square, space.smallest_p(np.random.default_rng(0))),
         probes=[Probe(k.name, k, (dataclasses.replace(k.neutral(Context())),)) for k in kinds],
-        sentences=(),
+        descriptions=(),
         parts=(),
         patterns=[PATTERN],
         chi2=square,

@@ -55,7 +55,7 @@ def scene(amplitudes, seed=3, columns=None, width=None):
         square=square,
         table=table,
         probes=[Probe(n, k, (k.neutral(Context()),)) for n in kinds for k in [effect_by_name(n)]],
-        sentences=[description(n, sizes[n]) for n in names if n not in kinds and n != "a pattern"],
+        descriptions=[description(n, sizes[n]) for n in names if n not in kinds and n != "a pattern"],
         parts=(),
         patterns=[name for name in names if name == "a pattern"],
         chi2=square,

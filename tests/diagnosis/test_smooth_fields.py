@@ -69,7 +69,7 @@ def examined():
     model = base_model(calset)
     result = fit(Likelihood.of(calset, model))
     listed = hypotheses(known_effects(model), model.template, calset.exposures, len(calset.points))
-    few = Hypotheses(listed.names[:4], listed.sentences[:60], (), listed.effects, (), listed.smooth)
+    few = Hypotheses(listed.names[:4], listed.descriptions[:60], (), listed.effects, (), listed.smooth)
     return examine(result, few, np.random.default_rng(0))
 
 

@@ -10,7 +10,7 @@ from small_run import small_fit
 from walop_jax.calibration.could_hide import change_by_effect
 from walop_jax.calibration.matrix import first_setting
 from walop_jax.diagnosis.examination import Examination, examine
-from walop_jax.diagnosis.grammar import sentences
+from walop_jax.diagnosis.grammar import descriptions
 from walop_jax.diagnosis.hypotheses import Hypotheses, Probe, probes
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.synonyms import _same_to_the_data
@@ -55,10 +55,10 @@ def asked() -> Examination:
 def test_what_says_the_same_is_one_candidate(asked):
     """Behind the polariser there is the collimator alone: what turns light there turns it behind the collimator too."""
     assert asked.synonyms == {TURNED[0]: (TURNED[1],)}
-    assert sorted(probe.name for probe in asked.sentences) == sorted([TURNED[0], *LOST])
+    assert sorted(probe.name for probe in asked.descriptions) == sorted([TURNED[0], *LOST])
     assert set(asked.space.names) == set(asked.bare.names) == set(asked.candidates)
     assert TURNED[1] not in asked.candidates
-    assert [row.name for row in asked.ranked_sentences].count(TURNED[0]) == 1
+    assert [row.name for row in asked.ranked_descriptions].count(TURNED[0]) == 1
 
 
 def test_what_data_cannot_tell_apart_and_stars_can_stays_apart(asked):
@@ -87,15 +87,15 @@ def test_a_name_of_the_catalogue_goes_before_what_describes_it():
     context = effect_context(fit.model.template, fit.calset.exposures)
     (name,) = probes([kind for kind in EFFECTS if kind.name == "standard_angles"], context)
     longer = "retardance v ahead of polariser * kind standard"
-    every = sentences(fit.model.template, fit.calset.exposures, len(fit.calset.points))
+    every = descriptions(fit.model.template, fit.calset.exposures, len(fit.calset.points))
     some = [probe for probe in every if probe.name == longer]
-    found = examine(fit, Hypotheses(names=[name], sentences=some), np.random.default_rng(0))
+    found = examine(fit, Hypotheses(names=[name], descriptions=some), np.random.default_rng(0))
     assert found.synonyms == {"standard_angles": (longer,)}
-    assert not found.sentences
+    assert not found.descriptions
     np.testing.assert_array_equal(found.candidates["standard_angles"].widths, name.widths)
     again = examine(fit, Hypotheses(names=[name]), np.random.default_rng(0))
     evidence = [one.table["standard_angles"].log_bayes for one in (found, again)]
     assert evidence[0] == pytest.approx(evidence[1], rel=1e-3)
     # Where the light has hardly changed, columns and names of an earlier examination serve again.
-    later = examine(fit, Hypotheses(names=[name], sentences=some), np.random.default_rng(0), found)
-    assert (later.synonyms, later.sentences) == (found.synonyms, ())
+    later = examine(fit, Hypotheses(names=[name], descriptions=some), np.random.default_rng(0), found)
+    assert (later.synonyms, later.descriptions) == (found.synonyms, ())

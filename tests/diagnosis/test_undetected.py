@@ -119,7 +119,7 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
     free = result.model.free
     shift = (other.values - result.values)[free] / size
     state = examined_with(result, drift.__eq__)
-    (probe,) = (probe for probe in state.sentences if probe.name == drift)
+    (probe,) = (probe for probe in state.descriptions if probe.name == drift)
     laid = LinearisedFit(state)
     root = _of_other_light(laid, LinearStep(laid, np.zeros(0, int), np.zeros(laid.design.rows)))
     at = state.bare.places()[probe.name]
@@ -154,7 +154,7 @@ def test_a_drift_that_no_test_shows_moves_the_parameters_as_a_fit_to_it_does(sou
 )
 def test_what_a_star_does_not_have(sound, name, absent):
     template, calset = sound[0].model.template, sound[0].calset
-    asked = grammar.sentences(template, calset.exposures, len(calset.points))
+    asked = grammar.descriptions(template, calset.exposures, len(calset.points))
     (probe,) = (probe for probe in asked if probe.name == name)
     assert _no_starlight(probe, template) == absent
 

@@ -8,7 +8,7 @@ from quick import quick
 from small_run import SMALL, WITH_PLATE
 
 from walop_jax.diagnosis import grammar
-from walop_jax.diagnosis.hypotheses import applicable, probes, sentences_of, showable
+from walop_jax.diagnosis.hypotheses import applicable, probes, showable, texts_of
 from walop_jax.fit.base_model import base_model
 from walop_jax.likelihood.columns import Columns, columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
@@ -181,9 +181,9 @@ def test_by_hand():
 def test_every_sentence_of_the_grammar_has_a_column(laid):
     likelihood, values = laid
     found = Columns(likelihood, values)
-    every = grammar.sentences(likelihood.model.template, likelihood.calset.exposures, 25)
+    every = grammar.descriptions(likelihood.model.template, likelihood.calset.exposures, 25)
     for probe in every:
-        for text in sentences_of(probe):
+        for text in texts_of(probe):
             assert found.has(_said(text)), text
 
 

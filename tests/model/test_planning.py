@@ -28,7 +28,7 @@ ROWS = [
 ]
 
 
-def with_sentences(*texts: str) -> Instrument:
+def with_descriptions(*texts: str) -> Instrument:
     return dataclasses.replace(DEVICE, effects=(Described.saying(list(texts), np.full(len(texts), 0.01)),))
 
 
@@ -61,7 +61,7 @@ def solved(device: Instrument) -> int:
 )  # fmt: skip
 def test_every_exposure_is_as_if_it_were_alone(texts, count):
     """A single exposure is solved at its own conditions; the first of the list goes with it, for the hours."""
-    device = with_sentences(*texts)
+    device = with_descriptions(*texts)
     together = rows_of(device, ROWS)
     for place in (1, 7, 24):
         alone = rows_of(device, [ROWS[0], ROWS[place]])

@@ -70,6 +70,15 @@ def test_signature_lies_beside_the_data(harmonic, abscissa):
         np.testing.assert_allclose(dots.get_xdata(), x, atol=1e-6)
 
 
+def test_nothing_explained_is_no_line():
+    """A diagnosis that found nothing drew a line at 0 and called it the effect."""
+    data = handmade_run.figure_data()
+    nothing = dict(data.comparisons[0].curves) | {"EXPLAINED": np.zeros((8, 4))}
+    one = dataclasses.replace(data.comparisons[0], curves=nothing)
+    figure = figures.signature_figure(one, data.exposures, data.cameras)
+    assert [line for axis in figure.axes for line in axis.lines if line.get_label() == "effect"] == []
+
+
 def test_exposures_at_one_angle_are_averaged():
     data = handmade_run.figure_data()
     angle = np.repeat([0.0, 45.0, 90.0, 135.0], 2)

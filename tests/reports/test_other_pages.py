@@ -140,6 +140,30 @@ def test_the_tracks_of_a_survey(tmp_path: Path):
     assert len(Page(written(tmp_path, "survey", **document)[0]).images) == 2
 
 
+def test_a_bad_night_is_marked_where_it_was():
+    """Not half way to the night before it, where its time begins."""
+    mjd = [61220.9, 61235.9, 61250.9, 61251.9]
+    table = Table(
+        {"NIGHT": [3, 4, 5, 6], "MJD": mjd, "NAME": ["half1.wedge"] * 4, "UNIT": ["rad"] * 4}
+        | {name: [0.1] * 4 for name in ("VALUE", "ERROR", "DEVIATION", "DEVIATION_ERR")}
+    )
+    bad = {
+        "name": "half1.wedge",
+        "kind": "bad night",
+        "night": 5,
+        "before": 61243.4,
+        "after": 61251.4,
+        "date": 61243.4,
+    }
+    document = {"breaks": [bad], "events": [], "laws": {}}
+    for rows, expected in ((table, mjd[2]), (table[[0, 1, 3]], 0.5 * (61243.4 + 61251.4))):
+        (axis,) = tracks_figure(rows, document).axes
+        dashed = [line for line in axis.lines if line.get_linestyle() == "--"]
+        assert [line.get_xdata()[0] for line in dashed] == [
+            pytest.approx(expected - 40587.0)
+        ]  # days since 1970
+
+
 @pytest.mark.parametrize(
     ("days", "events", "width"),
     [([0.85], [], 1.0), ([0.85, 0.87], [], 1.0), ([0.85], [3.85], 3.3), ([0.85, 10.85], [], 11.0)],

@@ -81,7 +81,7 @@ def scores(result: FitResult, draws: int, named: int) -> dict[str, dict[str, flo
     template, calset = result.model.template, result.calset
     context = effect_context(template, calset.exposures)
     every = list(probes(EFFECTS, context))
-    said = grammar.sentences(template, calset.exposures, len(calset.points))
+    said = grammar.descriptions(template, calset.exposures, len(calset.points))
     said = grammar.beside_names(said, EFFECTS, context, template)[0]
     names = examine(result, Hypotheses(every), np.random.default_rng(0))
     whole = examine(result, Hypotheses(every, said), np.random.default_rng(0))

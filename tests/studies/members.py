@@ -45,9 +45,9 @@ def judged(seed: int) -> sealed.Judged:
     context = effect_context(base.template, one.calset.exposures)
     model = with_effects(base, [Described.saying([TOLD], [size])], context)
     result = with_empirical_covariance(fit(Likelihood.of(one.calset, model))).with_verdict()
-    every = grammar.sentences(model.template, one.calset.exposures, len(one.calset.points))
+    every = grammar.descriptions(model.template, one.calset.exposures, len(one.calset.points))
     some = [probe for probe in every if probe.name.startswith(KINDS)]
-    state = examine(result, Hypotheses(sentences=some), np.random.default_rng(0))
+    state = examine(result, Hypotheses(descriptions=some), np.random.default_rng(0))
     classes = ambiguities(state, {TOLD: ()})
     return sealed.judged(averaged(Calibration.from_fit(result), classes), True, one)
 

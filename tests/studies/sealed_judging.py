@@ -151,7 +151,7 @@ def right_of(one: Sealed, diagnosis: Diagnosis) -> str:
         for name in names:
             effect = next((kind for kind in EFFECTS if kind.name == name), None)
             if effect is not None:
-                texts += effect.neutral(context).in_sentences(bare)
+                texts += effect.neutral(context).as_descriptions(bare)
             elif name not in (Described.name, FreeForm.name, OtherDescription.name):
                 texts += name.split("; ")
         return {home_of(text, bare) for text in texts}

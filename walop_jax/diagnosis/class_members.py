@@ -1,7 +1,7 @@
 """Equivalence class of each addition of a diagnosis: candidates indistinguishable from it, and their effect on stars.
 
-Additions    effects with a name, and groups of sentences. The class of an addition has as members all candidates that
-             could take its place and would not be improbable there (`thresholds.IMPROBABLE`), by one linear step.
+Additions    effects with a name, and groups of descriptions. The class of an addition has as members all candidates
+             that could take its place and would not be improbable there (`thresholds.IMPROBABLE`), by one linear step.
              Their prior probabilities are equal: a name does not make a candidate more probable.
 One step     A model without some amplitudes a leaves r + D of the residuals r, D = −J_a a. Other columns K take their
              place with b = −(KᵀPK)⁺ KᵀP(r + D), and all other parameters move by −J_o⁺ (D + K b), where P projects off
@@ -11,8 +11,8 @@ Kinds        An effect in exposures of one KIND is a difference between that KIN
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
              Equivalent members count once. The product is their mean, and its covariance has their spread: values and
              covariance of a model that includes all of them, each amplitude 0 in the models of the others.
-Limits       To first order. Structural effects, other descriptions and patterns of a single place have no sentence and
-             no part in it.
+Limits       To first order. Structural effects, other descriptions and patterns of a single place have no description
+             and no part in it.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import ClassMember, ClassOf, WeightedChanges, distinct, sentences_in
+from walop_jax.diagnosis.class_product import ClassMember, ClassOf, WeightedChanges, changes_in, distinct
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
-from walop_jax.diagnosis.hypotheses import sentences_of
+from walop_jax.diagnosis.hypotheses import texts_of
 from walop_jax.diagnosis.score import FAINTEST, log_bayes
 from walop_jax.diagnosis.synonyms import ALIKE
 from walop_jax.diagnosis.undetected_errors import usual_exposure
@@ -41,8 +41,7 @@ from walop_jax.fit.refit import PRIOR_EDGE
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
-from walop_jax.model.effects.change import KINDS, patched
-from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.change import KINDS, Change, patched
 from walop_jax.model.effects.in_models import effects_of
 
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
@@ -55,9 +54,9 @@ def classes_of(
 ) -> tuple[ClassOf, ...]:
     """The classes of what was added to a model, without those of a single member.
 
-    `added` are effects and groups of sentences, by name, each with the candidates reported as indistinguishable from
-    it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are sentences that
-    the model had before.
+    `added` are effects and groups of descriptions, by name, each with the candidates reported as indistinguishable from
+    it: with large residuals, where one linear step is inaccurate, these count as probable. `given` are descriptions
+    that the model had before.
     """
     fit, model, design = laid.fit, laid.fit.model, laid.design
     groups, classes = [name for name in added if name not in model.effect_names], list[ClassOf]()
@@ -67,13 +66,13 @@ def classes_of(
             change, sums = signature(fit, effect.name), tuple(map(tuple, effect.first_order(model.template)))
             classes.append(laid.class_of(effect.name, at, change, sums, added[effect.name], frozenset()))
         for name, group in _groups(effect, groups, given) if groups and isinstance(effect, Described) else ():
-            sentences = [Sentence.parsed(text) for text in group]
+            descriptions = [Change.parsed(text) for text in group]
             at = design.columns_of(
-                [model.index(f"{Described.name}.{sentence.label}") for sentence in sentences]
+                [model.index(f"{Described.name}.{description.label}") for description in descriptions]
             )
             if len(at):
                 change = -design.jacobian[: design.rows, at] @ fit.values[model.free[at]]
-                sums = tuple(((1.0, sentence),) for sentence in sentences)
+                sums = tuple(((1.0, description),) for description in descriptions)
                 whole = frozenset((*name.split("; "), *group))
                 classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ()), whole))
     return tuple(group for group in classes if group.names)
@@ -82,11 +81,11 @@ def classes_of(
 def _groups(
     effect: Described, groups: Sequence[str], given: Collection[str]
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The groups of sentences that were added, each with its name; an ungrouped sentence is a group of its own."""
+    """The groups of descriptions that were added, each with its name; one without a group is a group of its own."""
     ungrouped = [text for text in effect.sentences if text not in given]
     for name in groups:
         said = name.split("; ")
-        group = tuple(text for text in ungrouped if text in said or Sentence.parsed(text).candidate in said)
+        group = tuple(text for text in ungrouped if text in said or Change.parsed(text).candidate in said)
         ungrouped = [text for text in ungrouped if text not in group]
         if group:
             yield name, group
@@ -147,7 +146,7 @@ class LinearisedFit:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`.
 
         `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
-        `whole` is the group of sentences that was added, of which the addition is the part that remains; it is empty
+        `whole` is the group of descriptions that was added, of which the addition is the part that remains; it is empty
         for an effect with a name.
         """
         step = LinearStep(self, at, lost)
@@ -242,7 +241,7 @@ class LinearStep:
         """The best evidence, and candidates not improbable relative to it; `alike` and `whole` as in `class_of`.
 
         Each candidate comes with True if it is among `alike`. A change that the model has already is no candidate for
-        the place of the addition. If the addition is what remains of a group, its other sentences having been dropped,
+        the place of the addition. If the addition is what remains of a group, its other descriptions dropped,
         the evidence of the whole group is compared with that of other groups; the group itself is then no member.
         """
         state, design, texts = self.laid.state, self.laid.design, _texts(addition.sums)
@@ -257,7 +256,7 @@ class LinearStep:
             scored.append((evidence, bool({probe.name, probe.effect.name} & set(alike)), probe))
         scored.sort(key=lambda item: -item[0])
         groups = [item for item in scored if item[2].effect is Described]
-        larger = [evidence for evidence, _, probe in groups if set(sentences_of(probe)) > texts and whole]
+        larger = [evidence for evidence, _, probe in groups if set(texts_of(probe)) > texts and whole]
         best = max([min([addition.evidence, *larger[:1]]), *(evidence for evidence, *_ in scored[:1])])
         least, chosen = best - thresholds.IMPROBABLE, []
         for evidence, close, probe in scored:
@@ -288,25 +287,27 @@ class LinearStep:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
 
         None for a member that is not about one KIND. The `evidence` of the counterpart is given relative to that of the
-        member. `widths` are the prior widths of the member; None: those of its sentences.
+        member. `widths` are the prior widths of the member; None: those of its descriptions.
         """
-        kinds_by_sentence = [
-            [str(text).removeprefix("kind ") for text in sentence.factors if str(text).startswith("kind ")]
-            for sentence in sentences_in(member.sums)
+        kinds_by_change = [
+            [str(text).removeprefix("kind ") for text in description.factors if str(text).startswith("kind ")]
+            for description in changes_in(member.sums)
         ]
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
-        kinds = set(itertools.chain(*kinds_by_sentence))
+        kinds = set(itertools.chain(*kinds_by_change))
         other_kinds = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
-        if len(kinds) != 1 or not all(kinds_by_sentence) or not other_kinds:
+        if len(kinds) != 1 or not all(kinds_by_change) or not other_kinds:
             return None
         (kind,) = kinds
 
-        def elsewhere(sentence: Sentence, other: str) -> Sentence:
-            factors = (f"kind {other}" if text == f"kind {kind}" else text for text in sentence.factors)
-            return dataclasses.replace(sentence, factors=tuple(factors))
+        def elsewhere(description: Change, other: str) -> Change:
+            factors = (f"kind {other}" if text == f"kind {kind}" else text for text in description.factors)
+            return dataclasses.replace(description, factors=tuple(factors))
 
         sums = tuple(
-            tuple((-size, elsewhere(sentence, new)) for size, sentence in amplitude for new in other_kinds)
+            tuple(
+                (-size, elsewhere(description, new)) for size, description in amplitude for new in other_kinds
+            )
             for amplitude in member.sums
         )
         if not self._can_be_said(sums):
@@ -315,7 +316,7 @@ class LinearStep:
         if widths is None:
             largest = context_of(self.laid.fit).largest
             widths = np.array([amplitude[0][1].width(largest) for amplitude in sums])
-        name = "; ".join(sentence.text for sentence in sentences_in(sums))
+        name = "; ".join(description.text for description in changes_in(sums))
         twin = self.member(name, sums, column, widths)
         # It is the same difference between KINDs, told from the other side: as probable, whatever the throughputs are.
         alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
@@ -353,22 +354,22 @@ class LinearStep:
         return ClassMember(name, evidence, sums, change, amplitudes, covariance, values, slopes)
 
     def _can_be_said(self, sums: Sequence[WeightedChanges]) -> bool:
-        """True if a model can include all sentences."""
-        sentences = sentences_in(sums)
+        """True if a model can include all descriptions."""
+        descriptions = changes_in(sums)
         stated = {text for effect in effects_of(self.laid.fit.model) for text in effect.stated}
         if not all(map(self.laid.columns.has, sums)) or not all(
             s.kind in KINDS and all(isinstance(f, str) for f in s.factors) and s.text not in stated
-            for s in sentences
+            for s in descriptions
         ):
             return False
         bare = dataclasses.replace(self.laid.template, effects=())
         try:
-            patched(bare, [(sentence, jnp.zeros(())) for sentence in sentences])
+            patched(bare, [(description, jnp.zeros(())) for description in descriptions])
         except ValueError:
             return False
         return True
 
 
 def _texts(sums: Sequence[WeightedChanges]) -> set[str]:
-    """The sentences of some amplitudes."""
-    return {sentence.text for sentence in sentences_in(sums)}
+    """The descriptions of some amplitudes."""
+    return {description.text for description in changes_in(sums)}

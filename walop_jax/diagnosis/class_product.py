@@ -3,7 +3,7 @@
 Equation     m̄ = Σ w_k m_k,   C = Σ w_k [C_k + (m_k − m̄)(m_k − m̄)ᵀ],   w_k = B_k / Σ B
 Symbols      m_k values in model k, of numbers that may be 0 in some of them; C_k their covariance; B_k evidence
 Source       Leamer 1978, Specification Searches, ch. 4; Hoeting et al. 1999, Stat. Sci. 14, 382 (law of total variance)
-Model        that of the fit with the sentences of all members of all classes. An amplitude is 0 in the models of the
+Model        that of the fit with the descriptions of all members of all classes. An amplitude is 0 in the models of the
              others, so that values and covariance of the mixture are sufficient: the matrix, errors of stars and maps
              follow as for any other calibration. Members with the same effect on the result count once.
              Deviations from the shape of a description are the effect `deviations`, with their covariance.
@@ -30,22 +30,22 @@ from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.io.text import per_cent, some, two_digits
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.model.effects import Context, Described, Deviations
-from walop_jax.model.effects.change import Change as Sentence
-from walop_jax.model.effects.in_models import effect_context, with_effects, with_sentences
+from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.in_models import effect_context, with_descriptions, with_effects
 from walop_jax.model.effects.optics import GENERATORS
 from walop_jax.model.specification import Model
 
-WeightedChanges = tuple[tuple[float, Sentence], ...]
-"""One amplitude: a sum of sentences with their coefficients."""
+WeightedChanges = tuple[tuple[float, Change], ...]
+"""One amplitude: a sum of descriptions with their coefficients."""
 
 
-def sentences_in(sums: Sequence[WeightedChanges]) -> list[Sentence]:
-    """All sentences of some amplitudes."""
-    return [sentence for amplitude in sums for _, sentence in amplitude]
+def changes_in(sums: Sequence[WeightedChanges]) -> list[Change]:
+    """All descriptions of some amplitudes."""
+    return [description for amplitude in sums for _, description in amplitude]
 
 
 class ClassMember(NamedTuple):
-    """One member of a class: its words, ln B against the model without what was added, its amplitudes in sentences.
+    """One member of a class: its words, ln B against the model without what was added, its amplitudes in descriptions.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
     by its amplitudes, which have a `covariance`: empty for the addition itself, which the fit has. `change` is that of
@@ -97,7 +97,7 @@ class Shape(NamedTuple):
     the positions `on_stars` act on starlight, and are in the product (`Deviations`).
     """
 
-    changes: tuple[Sentence, ...]
+    changes: tuple[Change, ...]
     moment: AnyMatrix
     slopes: AnyMatrix
     on_stars: tuple[int, ...]
@@ -152,7 +152,7 @@ class Classes(NamedTuple):
         return Deviations.of(context, places=places, sentences=others) if changes else None
 
 
-def _place(change: Sentence) -> str:
+def _place(change: Change) -> str:
     """Place and dependence of a change of polarisation, as `Deviations` lists it."""
     return " * ".join((f"{change.relation} {change.place}", *change.beside_field))
 
@@ -165,7 +165,7 @@ def with_average(result: FitResult, classes: Classes) -> FitResult:
 def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
 
-    Its model includes all members, as sentences, and deviations from the shapes of descriptions; different additions
+    Its model includes all members, as descriptions, and deviations from the shapes of descriptions; different additions
     are taken as independent.
     """
     if not classes:
@@ -218,21 +218,21 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
 
 
 def _holding(calibration: Calibration, classes: Classes) -> Model:
-    """The model with the sentences of all members that no effect of it says by a name, and with deviations."""
+    """The model with the descriptions of all members that no effect of it says by a name, and with deviations."""
     model = calibration.model
     said = _said_by_name(model)
-    texts = dict.fromkeys(s.text for s in sentences_in(classes.sums) if s.text not in said)
+    texts = dict.fromkeys(s.text for s in changes_in(classes.sums) if s.text not in said)
     context = effect_context(model.template, calibration.exposures)
     if (effect := classes.deviations(model, context)) is not None:
         model = with_effects(model, [effect], context)
     if not texts:
         return model
     description = Described.saying(list(texts), np.zeros(len(texts)))
-    return with_sentences(model, description, context)
+    return with_descriptions(model, description, context)
 
 
 def _said_by_name(model: Model) -> dict[str, tuple[str, float]]:
-    """Parameters of effects with a name that are the amplitude of one sentence, and its coefficient, by the sentence.
+    """Parameters of named effects that are the amplitude of one description, and its coefficient, by the description.
 
     What moves in a member of a class is then that parameter, and not a description of the same change beside it.
     """
@@ -244,8 +244,8 @@ def _said_by_name(model: Model) -> dict[str, tuple[str, float]]:
         amplitudes = effect.first_order(model.template)
         for name, terms in zip(names, amplitudes, strict=False) if len(names) == len(amplitudes) else ():
             if len(terms) == 1 and name in model.names and model[name].free and model[name].tie is None:
-                ((coefficient, sentence),) = terms
-                said.setdefault(sentence.text, (name, coefficient))
+                ((coefficient, description),) = terms
+                said.setdefault(description.text, (name, coefficient))
     return said
 
 
@@ -257,21 +257,21 @@ def _derivatives(
 ) -> Float[np.ndarray, "n a"]:
     """Derivative of all parameters by amplitudes, each a sum of changes that an effect of the model holds.
 
-    Sentences that are `said` by a parameter of another effect (`_said_by_name`) change that.
+    Descriptions that are `said` by a parameter of another effect (`_said_by_name`) change that.
     """
     derivatives = np.zeros((len(model.parameters), len(sums)))
     for j, combination in enumerate(sums):
-        for size, sentence in combination:
-            name, coefficient = (said or {}).get(sentence.text, (f"{effect}.{sentence.label}", 1.0))
+        for size, description in combination:
+            name, coefficient = (said or {}).get(description.text, (f"{effect}.{description.label}", 1.0))
             derivatives[model.index(name), j] += size / coefficient
     return derivatives
 
 
 def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "n a"]) -> Model:
-    """The model in which the sentences `new` of one amplitude are one parameter, so that the covariance is proper.
+    """The model in which the descriptions `new` of one amplitude are one parameter, so that the covariance is proper.
 
-    What is the same multiple of the amplitudes as an earlier sentence is tied to it; any other combination of earlier
-    ones is held: its value and errors follow from theirs.
+    What is the same multiple of the amplitudes as an earlier description is tied to it; any other combination of
+    earlier ones is held: its value and errors follow from theirs.
     """
     parameters, free = list(model.parameters), list[int]()
     for i in new:
@@ -301,7 +301,7 @@ def _positive(matrix: AnyMatrix) -> AnyMatrix:
 
 
 def only_a_class(classes: Classes) -> Iterator[str]:
-    """A sentence on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
+    """A description on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
     for group in classes.additions:
         if not (_dominates(group.spread, group.stated) or group.off > thresholds.SEPARATION):
             continue

@@ -385,7 +385,7 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
 
     def fringes(probe: Probe) -> bool:
         terms = (change for member in probe.group for change in member.first_order(template))
-        return any(sentence.kind == "fringes" for change in terms for _, sentence in change)
+        return any(one.kind == "fringes" for change in terms for _, one in change)
 
     # Fringes need more wavelength nodes than all others: they have a program of their own.
     probes = sorted((p for p in examination.probes if p.name in chosen), key=fringes)

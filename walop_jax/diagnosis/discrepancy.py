@@ -52,8 +52,7 @@ from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.columns import Columns
 from walop_jax.likelihood.inverses import square_root
 from walop_jax.model.effects import Described, FreeForm
-from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, InExposures
-from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.change import AMPLITUDES, SINGLE, SLOW, Change, InExposures
 from walop_jax.model.effects.deviations import CUBIC
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
@@ -69,8 +68,8 @@ def ambiguities(
 ) -> Classes:
     """Classes of the additions to a model, shapes of its descriptions, and undetected changes.
 
-    `added` are effects and groups of sentences, by name, each with the candidates that are reported as
-    indistinguishable from it, `given` sentences that the model had before (`class_members.classes_of`).
+    `added` are effects and groups of descriptions, by name, each with the candidates that are reported as
+    indistinguishable from it, `given` descriptions that the model had before (`class_members.classes_of`).
     """
     if not state.result.model.template.cameras.pairs:
         return Classes()
@@ -132,7 +131,7 @@ class _Place(NamedTuple):
     origin: str
 
 
-def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], AnyVector, set[tuple[str, ...]]]:
+def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Change], AnyVector, set[tuple[str, ...]]]:
     """Deviations from the shapes of the descriptions in a model, their prior widths, and the laws described."""
     instrument = fit.model.instrument(fit.values)
     if not any(isinstance(effect, Described) for effect in instrument.effects):
@@ -152,7 +151,7 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Any
             squares[place] = squares.get(place, 0.0) + size**2
         laws.setdefault(place, {(): None}).setdefault(change.beside_field)
     listed = set(described.sentences)
-    changes, widths = list[Sentence](), list[float]()
+    changes, widths = list[Change](), list[float]()
     for place, square in squares.items():
         shapes = list(_shapes(place, tuple(laws[place]), fit, columns))
         count = len(shapes) / len(place.kinds)
@@ -166,7 +165,7 @@ def shape_changes(fit: FitResult, columns: Columns) -> tuple[list[Sentence], Any
 
 def _shapes(
     place: _Place, laws: Sequence[tuple[str, ...]], fit: FitResult, columns: Columns
-) -> Iterator[Sentence]:
+) -> Iterator[Change]:
     """All changes at a place that the model can include: patterns over the field with `laws`, and other slow ones.
 
     Steady gains are left out: the throughput has them. Other steady numbers of cameras have the first four patterns.
@@ -178,7 +177,7 @@ def _shapes(
     for law in dict.fromkeys((*laws, *slow)):
         patterns = CUBIC if law or place.kinds == GENERATORS else CUBIC[:4]
         for pattern, kind in itertools.product(patterns if over_field else CUBIC[:1], place.kinds):
-            change = Sentence(kind, place.where, place.place, (*pattern, *law), place.origin)
+            change = Change(kind, place.where, place.place, (*pattern, *law), place.origin)
             try:
                 change.check_factors(template)
             except ValueError:
@@ -203,7 +202,7 @@ class _AtData(InExposures):
             columns.exposures, points.x[:, None], points.y[:, None], wavelength, columns.likelihood.used
         )
 
-    def rms(self, change: Sentence) -> float:
+    def rms(self, change: Change) -> float:
         """Root mean square of the factors of a change."""
         sizes = np.nan_to_num(np.asarray(change.factor(self), float))
         return float(np.sqrt(np.mean(np.broadcast_to(sizes, self.used.shape)[self.used] ** 2)))
@@ -268,9 +267,9 @@ def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
 def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
     """The undetected changes of a place; None of a place that has none."""
     over_field = len(laid.fit.calset.points) >= FEWEST_POINTS
-    changes, degrees = list[Sentence](), list[tuple[str, int]]()
+    changes, degrees = list[Change](), list[tuple[str, int]]()
     for (pattern, degree), kind in itertools.product(zip(CUBIC, DEGREES, strict=True), GENERATORS):
-        change = Sentence(kind, where, place, pattern)
+        change = Change(kind, where, place, pattern)
         if (over_field or not degree) and laid.columns.has(((1.0, change),)) and data.rms(change) > 0.0:
             changes.append(change)
             degrees.append((kind.partition(" ")[0], degree))

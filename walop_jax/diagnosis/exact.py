@@ -31,7 +31,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.findings import Choice, FitComparison
-from walop_jax.diagnosis.hypotheses import Ranked, sentences_of
+from walop_jax.diagnosis.hypotheses import Ranked, texts_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
 from walop_jax.io.shapes import Vector
@@ -39,7 +39,7 @@ from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import JOINED, alternatives, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
-from walop_jax.model.effects.in_models import effect_context, model_without, with_effects, with_sentences
+from walop_jax.model.effects.in_models import effect_context, model_without, with_descriptions, with_effects
 from walop_jax.model.light_path import NoSuchPlaceError
 from walop_jax.model.parameters import leaves, values_of
 from walop_jax.model.specification import Model
@@ -62,7 +62,7 @@ class Trial:
     against          KINDs of exposures that contradict it
     refused          the reason for which it was not added; empty while nothing speaks against it
     score, p_value   of the linear test at the time when it was added
-    groups           groups of sentences added one after the other, each with the candidates that were as good then
+    groups           groups of descriptions added one after the other, each with the candidates that were as good then
     synonyms         other names (`synonyms.synonyms`) of the trial, and of its `nameless` rivals
     """
 
@@ -102,12 +102,12 @@ class Trial:
         return self.fit.model.instrument(self.fit.values).effect(self.effect.name).standard_form()
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """Its equivalent sentences, where it has no name."""
+    def texts(self) -> tuple[str, ...]:
+        """Texts of its descriptions, where it has no name."""
         if self.effect is not Described:
             return ()
         if self.fit is None:
-            return () if self.item is None else sentences_of(self.item.probe)
+            return () if self.item is None else texts_of(self.item.probe)
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
@@ -158,12 +158,12 @@ def try_effect(
 ) -> Trial:
     """Add an effect at the given values to the fitted model and fit everything again.
 
-    Sentences join those that the model has. The prior of the name is divided among its `prior_shapes` shapes, and the
-    prior widths of new sentences are multiplied with `scale`. The other parameters start at their fitted values, or at
-    `start`, if the misfit of the model has bent the fitted ones.
+    Descriptions join those that the model has. The prior of the name is divided among its `prior_shapes` shapes, and
+    the prior widths of new descriptions are multiplied with `scale`. The other parameters start at their fitted values,
+    or at `start`, if the misfit of the model has bent the fitted ones.
     """
     if isinstance(instance, Described):
-        model = with_sentences(base.model, instance, base.calset)
+        model = with_descriptions(base.model, instance, base.calset)
         for p in model.parameters if scale != 1.0 else ():
             if p.name not in base.model.names and p.prior is not None:
                 model = model.change(p.name, prior=(p.prior[0], scale * p.prior[1]))

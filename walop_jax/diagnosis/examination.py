@@ -1,7 +1,7 @@
 """Candidates for missing physics, by linear algebra: scores, ranking by evidence, equivalent candidates.
 
 Evidence      Of a candidate alone: ln B of the score test (`score.log_bayes`). Alternative shapes of an effect share
-              its prior, sentences share that of one name.
+              its prior, descriptions share that of one name.
 Separation    The change D of the residuals that a candidate makes at its amplitudes, projected off the other
               parameters, is fitted by each rival; the length of the remainder is the separation in
               standard deviations (Atkinson & Fedorov 1975, Biometrika 62, 57). Below `thresholds.SEPARATION` the data
@@ -60,7 +60,7 @@ def follow_physics(probe: Probe, amplitudes: AnyVector, covariance: AnyMatrix) -
 
 
 def shortest(item: Ranked) -> Described:
-    """The sentences of a group that are worth their length, with the amplitudes of a linear step.
+    """The descriptions of a group that are worth their length, with the amplitudes of a linear step.
 
     All subsets of `thresholds.MOST_TOGETHER` members or fewer are compared, and those that the whole group passes
     through as it loses its least probable member again and again.
@@ -86,7 +86,7 @@ class Evidence:
     """The part of one set of residuals that each candidate explains beyond the base parameters.
 
     `space` is that of all candidates behind the nuisance that single exposures may have, `scores` are C̃ᵀr and
-    `square` r·r there. `probes` are effects, `sentences` what else can be said, `parts` sentences that are reported as
+    `square` r·r there. `probes` are effects, `descriptions` what else can be said, `parts` those that are reported as
     the effects that hold them (`grammar.beside_names`), `patterns` the names of patterns without a name. `chi2` and
     `dof` are those of the fit, `scale` the factor on the errors with which it was made. `synonyms` are other
     names of candidates (`synonyms.synonyms`).
@@ -97,7 +97,7 @@ class Evidence:
     square: float
     table: ScoreTable
     probes: Sequence[Probe]
-    sentences: Sequence[Probe]
+    descriptions: Sequence[Probe]
     parts: Sequence[Probe]
     patterns: Sequence[str]
     chi2: float
@@ -105,7 +105,7 @@ class Evidence:
     scale: float = 1.0
     synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
-    @property
+    @cached_property
     def smooth(self) -> SmoothFields | None:
         """Smooth fields that may be missing; None where columns were not kept."""
         return None
@@ -117,7 +117,7 @@ class Evidence:
     @property
     def asked(self) -> tuple[Probe, ...]:
         """All candidates but patterns."""
-        return (*self.probes, *self.sentences, *self.parts)
+        return (*self.probes, *self.descriptions, *self.parts)
 
     @cached_property
     def ranked(self) -> list[Ranked]:
@@ -127,20 +127,20 @@ class Evidence:
     @property
     def price(self) -> float:
         """Logarithm of the number of descriptions, which share the prior of one name: each pays it."""
-        return float(np.log(max(len(self.sentences), 1)))
+        return float(np.log(max(len(self.descriptions), 1)))
 
     @cached_property
-    def ranked_sentences(self) -> list[Ranked]:
-        """Sentences in order of evidence, each less the logarithm of their number."""
+    def ranked_descriptions(self) -> list[Ranked]:
+        """Descriptions in order of evidence, each less the logarithm of their number."""
         price = self.price
-        scored = [(probe, self.table[probe.name]) for probe in self.sentences]
+        scored = [(probe, self.table[probe.name]) for probe in self.descriptions]
         candidates = (Ranked(p, s, s.log_bayes - price) for p, s in scored if s.testable)
         return sorted(candidates, key=lambda item: -item.log_bayes)
 
     @cached_property
     def by_name(self) -> Mapping[str, Ranked]:
-        """Effects and sentences by name."""
-        return {item.name: item for item in (*self.ranked, *self.ranked_sentences)}
+        """Effects and descriptions by name."""
+        return {item.name: item for item in (*self.ranked, *self.ranked_descriptions)}
 
     def is_clear(self, score: Score) -> bool:
         """True if a candidate is significant by itself, after correction for all."""
@@ -152,9 +152,9 @@ class Evidence:
         return [item for item in self.ranked if self.is_clear(item.score)]
 
     @cached_property
-    def significant_sentences(self) -> list[Ranked]:
-        """Sentences that are significant by themselves, best evidence first."""
-        return [item for item in self.ranked_sentences if self.is_clear(item.score)]
+    def significant_descriptions(self) -> list[Ranked]:
+        """Descriptions that are significant by themselves, best evidence first."""
+        return [item for item in self.ranked_descriptions if self.is_clear(item.score)]
 
     @property
     def alarm(self) -> bool:
@@ -376,7 +376,7 @@ def examine(
     *,
     synonyms_apart: bool = False,
 ) -> Examination:
-    """Score effects that a model has not, sentences and patterns against a fit.
+    """Score effects that a model has not, descriptions and patterns against a fit.
 
     Descriptions that say what another candidate says are names of that one (`synonyms`); with `synonyms_apart`, for
     studies, each is a candidate of its own. `earlier` is of a smaller model: its names hold here, and its columns serve
@@ -392,7 +392,7 @@ def examine(
         wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
         computed = all_candidates(design.columns, wanted)
     probes = [p for p in hypotheses.names if p.name in computed and p.effect.name not in active]
-    sentences = tuple(probe for probe in hypotheses.sentences if probe.name in computed)
+    descriptions = tuple(probe for probe in hypotheses.descriptions if probe.name in computed)
     parts = [
         dataclasses.replace(p, holders=frozenset(kind for kind in p.holders if kind.name not in active))
         for p in hypotheses.parts
@@ -406,7 +406,7 @@ def examine(
             for item in map(design.measured.candidate, strata(design.measured))
         ]
     )
-    of_probes = [computed[probe.name] for probe in (*probes, *sentences, *parts)]
+    of_probes = [computed[probe.name] for probe in (*probes, *descriptions, *parts)]
     candidates = {candidate.name: candidate for candidate in (*of_probes, *patterns)}
     names = list(candidates)
     widths, columns = zip(*((c.widths, c.columns) for c in candidates.values()), strict=True)
@@ -418,9 +418,9 @@ def examine(
     else:
         bare = ScoreSpace.projected(design.projector, names, widths, columns, scale=scale, exact=exact)
     if known is None:
-        known = synonyms(design, bare, candidates, (*probes, *sentences))
+        known = synonyms(design, bare, candidates, (*probes, *descriptions))
         if said := set(itertools.chain(*known.values())):
-            sentences = tuple(probe for probe in sentences if probe.name not in said)
+            descriptions = tuple(probe for probe in descriptions if probe.name not in said)
             names = [name for name in names if name not in said]
             candidates, bare = {name: candidates[name] for name in names}, bare.subset(names)
     r = design.projector(design.residual)
@@ -435,7 +435,7 @@ def examine(
         square=square,
         table=space.table(scores, square, space.smallest_p(rng)),
         probes=probes,
-        sentences=sentences,
+        descriptions=descriptions,
         parts=parts,
         patterns=[pattern.name for pattern in patterns],
         chi2=result.chi2,

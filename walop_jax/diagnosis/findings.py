@@ -185,7 +185,7 @@ class Step(FitComparison):
     `robust_ratio` are the errors of its parameters when every exposure may have a disturbance of its own, over the
     errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same effect
     that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
-    is the distance (σ) of each rival from it. `descriptions` are the sentences of an effect without a name
+    is the distance (σ) of each rival from it. `descriptions` are those of an effect without a name
     (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
     `also_called` are other names of it and of those, by name (`synonyms`). `about` is the effect in words with its
     place, `probability` that of its name among all names of the list, given that one of them is true (NaN: unknown).
@@ -438,7 +438,7 @@ _ADVICE = r"(: | \(|; | )walop-jax diagnose looks for [a-z ]+\)?$"
 
 
 def descriptions_of(result: FitResult) -> tuple[tuple[Change, float, float], ...]:
-    """The sentences of a fitted model, each with its amplitude and standard error."""
+    """The descriptions of a fitted model, each with its amplitude and standard error."""
     if Described.name not in result.model.effect_names:
         return ()
     effect = result.model.instrument(result.values).effect(Described.name)
@@ -458,7 +458,7 @@ def _said(descriptions: Sequence[tuple[Change, float, float]]) -> Iterator[dict[
         together.setdefault(change.candidate, []).append((change, amplitude, sigma))
     for name, terms in together.items():
         first = terms[0][0]
-        yield _sentence(*terms[0]) if name == first.text else _smooth(name, terms)
+        yield _described(*terms[0]) if name == first.text else _smooth(name, terms)
 
 
 def _smooth(name: str, terms: Sequence[tuple[Change, float, float]]) -> dict[str, Any]:
@@ -476,7 +476,7 @@ def _smooth(name: str, terms: Sequence[tuple[Change, float, float]]) -> dict[str
     )
     first = terms[0][0]
     law = dataclasses.replace(first, factors=first.beside_field)
-    entry = _sentence(law, value, sigma)
+    entry = _described(law, value, sigma)
     dependence = ["in a smooth field (rms over the field)", *entry["dependence"]]
     kind = entry["words"].partition(": ")[0]
     words = f"{kind}, {', '.join(dependence)}: {entry['words'].partition(': ')[2].partition(',')[0]}"
@@ -486,7 +486,7 @@ def _smooth(name: str, terms: Sequence[tuple[Change, float, float]]) -> dict[str
     }  # fmt: skip
 
 
-def _sentence(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
+def _described(change: Change, amplitude: float, sigma: float) -> dict[str, Any]:
     unit = Described.numbers()[change.parameter].unit
     value, error = value_and_error(amplitude, sigma)
     kind, *dependence = change.in_words().split(", ")

@@ -1,6 +1,6 @@
-"""Sentences on all possible omissions of an instrument model: kind × place × dependence, from train and exposures.
+"""Descriptions on all possible omissions of an instrument model: kind × place × dependence, from train and exposures.
 
-A *group* of sentences is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
+A *group* of descriptions is one candidate of the score test: a linear retarder has two axes, a harmonic a cosine and a
 sine, a gradient two directions.
 
     kinds         those of `model.effects`, in the groups of `optics.GROUPS`
@@ -10,7 +10,7 @@ sine, a gradient two directions.
                   dependence on wavelength, time, temperature, hour angle, angles, exposures and counts
                   (`Combinations`), of those that the exposures can distinguish (`Dependences`)
 
-The evidence of each sentence is reduced by the logarithm of their number. `beside_names` finds the groups that are
+The evidence of each description is reduced by the logarithm of their number. `beside_names` finds the groups that are
 equivalent to an effect of the catalogue, or part of one.
 """
 
@@ -33,13 +33,12 @@ from walop_jax.diagnosis.hypotheses import (
     SmoothField,
     applicable,
     probes,
-    sentences_of,
+    texts_of,
 )
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.cameras import POWERS
-from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY
-from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY, Change
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.effects.numbers import OF_QU
@@ -54,10 +53,10 @@ from walop_jax.sky.nights import first_of_nights
 ROUNDED = 1e-4  # hours, of times in descriptions
 
 
-def sentences(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
+def descriptions(instrument: Instrument, exposures: Exposures, points: int) -> tuple[Probe, ...]:
     """All groups that an instrument and its exposures allow, short ones first; `points` counts the field points."""
     groups = dict.fromkeys(_groups(dataclasses.replace(instrument, effects=()), exposures, points))
-    texts = ([sentence.text for sentence in group] for group in sorted(groups, key=len))
+    texts = ([description.text for description in group] for group in sorted(groups, key=len))
     context = effect_context(instrument, exposures)
     return tuple(
         Probe("; ".join(t), Described, tuple(Described.of(context, sentences=(text,)) for text in t), context)
@@ -70,14 +69,14 @@ def hypotheses(
 ) -> Hypotheses:
     """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits."""
     context = effect_context(instrument, exposures)
-    all_probes = sentences(instrument, exposures, points)
+    all_probes = descriptions(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)
     alone, partial = beside_names(all_probes, effects, context, instrument)
     smooth = smooth_fields(instrument, exposures, points)
     return Hypotheses(tuple(probes(effects, context)), alone, partial, effects, all_probes, smooth)
 
 
-# ------------------------------------------------------------------------------------- names that are sentences
+# ------------------------------------------------------------------------------------- names that are descriptions
 
 
 def beside_names(
@@ -87,13 +86,13 @@ def beside_names(
 
     A part is a group that effects hold, none of them as a whole: one patch of all, the light in one camera.
     """
-    # Shape by shape, where each sentence has an amplitude.
+    # Shape by shape, where each description has an amplitude.
     shapes = [Probe(effect.name, effect, group) for effect in catalogue for group in effect.probes(context)]
-    named = [(frozenset(shape.group[0].in_sentences(instrument)), shape) for shape in shapes]
+    named = [(frozenset(shape.group[0].as_descriptions(instrument)), shape) for shape in shapes]
     named = [(texts, shape.effect) for texts, shape in named if len(texts) <= len(shape.parameters)]
     alone, partial = [], []
     for probe in all_probes:
-        own = frozenset(sentences_of(probe))
+        own = frozenset(texts_of(probe))
         holders = frozenset(effect for texts, effect in named if texts > own)
         if any(texts == own for texts, _ in named):
             continue
@@ -104,27 +103,29 @@ def beside_names(
     return alone, partial
 
 
-def retimed(sentence: Sentence, exposures: Exposures, end: int) -> list[Sentence]:
+def retimed(description: Change, exposures: Exposures, end: int) -> list[Change]:
     """The same with another start (`end` 0) or stop (1), at all times within the spacing of the first search.
 
-    Empty for a sentence without start and stop between two exposures.
+    Empty for a description without start and stop between two exposures.
     """
     times = starts_of_steps(exposures)
-    if [factor.form for factor in sentence.grows_with] != ["hours"]:
+    if [factor.form for factor in description.grows_with] != ["hours"]:
         return []
-    hours = [float(text) for text in sentence.grows_with[0].given]
+    hours = [float(text) for text in description.grows_with[0].given]
     at = int(np.argmin(np.abs(times - hours[end])))
     if abs(times[at] - hours[end]) > ROUNDED:
         return []
     reach = -(-len(times) // STEPS)
     near = times[max(at - reach, 0) : at + reach + 1]
     spans = [(time, hours[1]) if end == 0 else (hours[0], time) for time in near]
-    return [dataclasses.replace(sentence, factors=(between(*span),)) for span in spans if span[0] < span[1]]
+    return [
+        dataclasses.replace(description, factors=(between(*span),)) for span in spans if span[0] < span[1]
+    ]
 
 
 # ------------------------------------------------------------------------------------------------------ all groups
 
-Base = tuple[Sentence, ...]
+Base = tuple[Change, ...]
 Mask = Bool[np.ndarray, " e"]
 
 
@@ -147,17 +148,17 @@ class Subject(NamedTuple):
 
 
 def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Base:
-    return tuple(Sentence(kind, where, place, origin=origin) for kind in kinds)
+    return tuple(Change(kind, where, place, origin=origin) for kind in kinds)
 
 
 def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[Base]:
-    """All groups of sentences: the changes of each subject, with each pattern over the field and each law."""
+    """All groups of descriptions: the changes of each subject, with each pattern over the field and each law."""
     for bases, patterns, group, order in _with_laws(instrument, exposures, points):
         for pattern, base in itertools.product(patterns, bases):
             pairs = [
                 tuple(filter(None, pair[::order])) for pair in itertools.product(group, PATTERNS[pattern])
             ]
-            yield tuple(sentence.times(*pair) for sentence in base for pair in pairs)
+            yield tuple(description.times(*pair) for description in base for pair in pairs)
 
 
 def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> tuple[SmoothField, ...]:
@@ -169,7 +170,7 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
         if not any(PATTERNS[pattern] != ("",) for pattern in patterns if pattern != "rings"):
             continue
         for base in bases:
-            changes = [sentence.times(*filter(None, (law,))) for sentence in base for law in group]
+            changes = [description.times(*filter(None, (law,))) for description in base for law in group]
             # All amplitudes of one kind come together, as `Described` has them.
             changes.sort(key=lambda change: list(AMPLITUDES).index(change.parameter))
             field = SmoothField(tuple(changes), pattern_first=order < 0)
@@ -262,14 +263,14 @@ def _of_plates(instrument: Instrument, exposures: Exposures) -> Iterator[Subject
         yield Subject.of(_base(("axis",), "of", place), inside=inside[place])
     for place, plate in plates.items():
         layers = [f"{place}.{layer.name}" for layer in plate.layers]  # pyright: ignore[reportAttributeAccessIssue]
-        yield Subject.of(tuple(Sentence("thickness", "of", layer) for layer in layers))
+        yield Subject.of(tuple(Change("thickness", "of", layer) for layer in layers))
         for kind, affected in (("axis", layers[1:]), ("cut", layers)):
             yield from (Subject.of(_base((kind,), "of", layer)) for layer in affected)
     if plates and varies(exposures.temp):
-        yield Subject.of(tuple(Sentence("thermal", "of", place) for place in plates))
+        yield Subject.of(tuple(Change("thermal", "of", place) for place in plates))
     for pair in probed_gaps(instrument.units) if plates else ():
         gaps = tuple(f"gap {gap:g}" for gap in pair)
-        yield Subject.of(*(tuple(Sentence("fringes", "of", p, (gap,)) for gap in gaps) for p in plates))
+        yield Subject.of(*(tuple(Change("fringes", "of", p, (gap,)) for gap in gaps) for p in plates))
 
 
 def _of_cameras(

@@ -20,7 +20,7 @@ from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis.score import Candidate, Score
 from walop_jax.io.shapes import AnyVector
 from walop_jax.io.text import rounded
-from walop_jax.likelihood.columns import Columns, SumOfSentences, own_columns
+from walop_jax.likelihood.columns import Columns, SumOfChanges, own_columns
 from walop_jax.model import legendre
 from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
@@ -38,7 +38,7 @@ FEWEST_POINTS = 9  # in which a pattern over the field is looked for, or what re
 class Probe:
     """One group of probes of an effect: the place in its shape space from which a linear step is taken.
 
-    `context` are the data that its prior widths are for, `holders` effects of which a group of sentences is a part.
+    `context` are the data that its prior widths are for, `holders` effects of which a group of descriptions is a part.
     The effect `etalon` has a probe for each gap of air that is tried; its group holds two members, a quarter of a
     fringe apart, whose amplitudes are those of a cosine and a sine.
     """
@@ -68,7 +68,7 @@ class Probe:
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """An effect or a sentence with its best probe, and its evidence; `others` are shapes that may be as good.
+    """An effect or a description with its best probe, and its evidence; `others` are shapes that may be as good.
 
     `scale` is the factor on the prior widths of its amplitudes with which it is fitted: 1, but for smooth fields.
     """
@@ -119,15 +119,15 @@ class SmoothField(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """All possible omissions of a model: probes of effects with a name, and sentences.
+    """All possible omissions of a model: probes of effects with a name, and descriptions.
 
-    `sentences` are those that no effect holds, `parts` those that are a part of effects. `effects` are those that fit
-    the instrument, `every` all sentences, those that are an effect by another name as well. `smooth` are changes that
-    may vary over the field in any smooth way, which no list of simple patterns holds.
+    `descriptions` are those that no effect holds, `parts` those that are a part of effects. `effects` are those that
+    fit the instrument, `every` all descriptions, those that are an effect by another name as well. `smooth` are changes
+    that may vary over the field in any smooth way, which no list of simple patterns holds.
     """
 
     names: Sequence[Probe] = ()
-    sentences: Sequence[Probe] = ()
+    descriptions: Sequence[Probe] = ()
     parts: Sequence[Probe] = ()
     effects: tuple[EffectKind, ...] = ()
     every: Sequence[Probe] = ()
@@ -136,7 +136,7 @@ class Hypotheses(NamedTuple):
     def beside(self, effects: Collection[str]) -> tuple[Probe, ...]:
         """All candidates beside the effects that a model has."""
         absent = (probe for probe in self.names if probe.effect.name not in effects)
-        return (*absent, *self.sentences, *self.parts)
+        return (*absent, *self.descriptions, *self.parts)
 
     @property
     def amplitudes(self) -> int:
@@ -210,7 +210,7 @@ def showable(calset: CalibrationSet, instrument: Instrument, wanted: Sequence[Pr
 
 
 def all_candidates(columns: Columns, wanted: Sequence[Probe]) -> dict[str, Candidate]:
-    """Columns of effects and, in single precision, of sentences, by name.
+    """Columns of effects and, in single precision, of descriptions, by name.
 
     Without effects that the set cannot show, and without fringes that the bands blur away.
     """
@@ -224,14 +224,16 @@ def candidates_by_points(
     likelihood, template = columns.likelihood, columns.likelihood.model.template
     effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
     shown = [*effects, *(p for p in wanted if p.effect is Described)]
-    linear: dict[str, list[SumOfSentences]] = {}
+    linear: dict[str, list[SumOfChanges]] = {}
     for probe in shown:
         members = [member.first_order(template) for member in probe.group]
         if all(terms and all(map(columns.has, terms)) for terms in members):
             linear[probe.name] = list(itertools.chain(*members))
-    # Fringes need more wavelength nodes than all other sentences.
+    # Fringes need more wavelength nodes than all other descriptions.
     gaps = {
-        name: [sentence.gap for change in sums for _, sentence in change if sentence.kind == "fringes"]
+        name: [
+            description.gap for change in sums for _, description in change if description.kind == "fringes"
+        ]
         for name, sums in linear.items()
     }
     survives = columns.survives(list(itertools.chain(*gaps.values())))
@@ -254,6 +256,6 @@ def candidates_by_points(
         yield candidates
 
 
-def sentences_of(probe: Probe) -> tuple[str, ...]:
-    """The sentences of a group."""
+def texts_of(probe: Probe) -> tuple[str, ...]:
+    """The descriptions of a group."""
     return tuple(text for member in probe.group for text in member.sentences)  # type: ignore[attr-defined]

@@ -25,7 +25,7 @@ from walop_jax.diagnosis.exact import (
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice, FitComparison
-from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, sentences_of
+from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, texts_of
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.diagnosis.search import Reason, Round, State
 from walop_jax.fit.refit import FitResult, fit
@@ -80,7 +80,7 @@ class Refits:
             if not self._hopeful(evidence, item):
                 return dataclasses.replace(trial, predicts=False)
             description = self._description(evidence, item)
-            refitted = try_effect(evidence.result, description, len(evidence.sentences), scale=item.scale)
+            refitted = try_effect(evidence.result, description, len(evidence.descriptions), scale=item.scale)
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, shapes)
@@ -98,7 +98,7 @@ class Refits:
         result = evidence.result
         for end in (0, 1) if not further else ():
             if times := grammar.retimed(change, result.calset.exposures, end):
-                c = columns(result.likelihood, result.values, [[(1.0, sentence)] for sentence in times])
+                c = columns(result.likelihood, result.values, [[(1.0, one)] for one in times])
                 c = evidence.design.projector(evidence.design.stacked([c]))
                 along, square = c.T @ evidence.design.residual, np.sum(c**2, axis=0)
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
@@ -106,11 +106,11 @@ class Refits:
         return description if further else Described.saying([change.text], [float(amplitude)])
 
     def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
-        """True if the linear step of a sentence predicts held-out data.
+        """True if the linear step of a description predicts held-out data.
 
         Effects of the catalogue are not asked: their names support them.
         """
-        single = any("exposure" in text for text in sentences_of(item.probe))
+        single = any("exposure" in text for text in texts_of(item.probe))
         candidate = evidence.candidate(item.probe.name)
         column = [dataclasses.replace(candidate, widths=item.scale * candidate.widths)]
         return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)

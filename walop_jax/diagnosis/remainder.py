@@ -49,7 +49,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     adopted = state.steps or (remainder is not None and remainder.free_form)
     if adopted and (worse := _worse(first.evidence, state)):
         return _not_adopted(first, state, worse)
-    added = tuple(name for step in state.steps for name in step.groups)  # groups of sentences
+    added = tuple(name for step in state.steps for name in step.groups)  # groups of descriptions
     if remainder is not None:
         against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
@@ -194,7 +194,7 @@ def _unexplained(evidence: Examination) -> Unexplained:
         text = f"unidentified patterns: {'; '.join(f'{name} (p = {p:.1g})' for name, p in patterns)}"
     else:
         text = "something is missing, but no single pattern is significant by itself"
-    leading = [*evidence.significant[:1], *evidence.significant_sentences[:1]] if evidence.alarm else []
+    leading = [*evidence.significant[:1], *evidence.significant_descriptions[:1]] if evidence.alarm else []
     if leading:
         nearest = max(leading, key=lambda item: item.log_bayes)
         p = evidence.table.corrected(nearest.score)

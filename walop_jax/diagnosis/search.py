@@ -276,7 +276,7 @@ class _RoundInProgress:
             reason = trial.refused or ("" if name == added else first)
             p = table.p_global if trial.item is None else table.corrected(trial.item.score)
             yield Reason(name, trial.evidence, p, trial.fit is not None, reason, trial.against)
-        for ranked in (self.evidence.significant, self.evidence.significant_sentences):
+        for ranked in (self.evidence.significant, self.evidence.significant_descriptions):
             for item in ranked[:MOST_LISTED]:
                 if item.name not in self.trials:
                     p = table.corrected(item.score)

@@ -115,7 +115,7 @@ class JointScores:
         names, sizes, scores = list(space.names), np.array(space.sizes), np.asarray(evidence.scores)
         self.widths = np.where(space.alive, space.widths, 0.0)
         if smooth is not None:
-            # A smooth field has thousands of names of its own: the sentences are made when one is fitted.
+            # The descriptions of a smooth field, a hundred at a time, are made when it is fitted.
             self.probes |= {name: Probe(name, Described, ()) for name in smooth.names}
             names, sizes = [*names, *smooth.names], np.concatenate([sizes, smooth.sizes])
             self.widths = np.concatenate([self.widths, smooth.widths])

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis.design import Design
-from walop_jax.diagnosis.hypotheses import Probe, sentences_of
+from walop_jax.diagnosis.hypotheses import Probe, texts_of
 from walop_jax.diagnosis.score import Candidate, ScoreSpace
 from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.likelihood.starlight import added_to_starlight
@@ -65,7 +65,7 @@ def _preference(probe: Probe) -> tuple[int, int]:
     """Names of the catalogue first, in its order; of descriptions those of a KIND, and the shortest."""
     if probe.effect is not Described:
         return 0, 0
-    return 2 - all("kind " in text for text in sentences_of(probe)), len(probe.name)
+    return 2 - all("kind " in text for text in texts_of(probe)), len(probe.name)
 
 
 def _same_to_the_data(space: ScoreSpace, probes: Sequence[Probe]) -> Iterator[list[Probe]]:
@@ -104,7 +104,7 @@ def _changes(
 ) -> dict[str, Float[np.ndarray, "p m k"]]:
     """Change of the elements of the matrix by the amplitudes of probes, refitted, in errors of the elements.
 
-    Without those that have no sentences.
+    Without those that have no descriptions.
     """
     fit, template = design.fit, design.fit.model.template
     every_sum = {p.name: [tuple(t) for m in p.group for t in m.first_order(template)] for p in probes}

@@ -32,7 +32,7 @@ FLOOR = 1.25  # σ of the residuals behind all candidates above which evidence c
 # Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added; and
 # by which another reading of the data must, to be reported.
 PART = 10.0
-HOPEFUL = 1.0  # standard errors by which the linear step of a sentence must predict unseen settings better
+HOPEFUL = 1.0  # standard errors by which the linear step of a description must predict unseen settings better
 # Difference in evidence that is no preference. More loss in ln p of the exposures of one KIND, as those of others
 # predict them, and in −χ²/2 of that, contradicts an addition.
 EVEN_ODDS = 3.0

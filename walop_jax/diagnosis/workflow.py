@@ -1,6 +1,6 @@
 """The workflow: fit, examine, and while something is missing search for its name; then what remains.
 
-1. Fit the model. 2. Score every effect of the catalogue, every sentence (`grammar`) and every pattern without a
+1. Fit the model. 2. Score every effect of the catalogue, every description (`grammar`) and every pattern without a
 name; global p by Monte Carlo. 3. Below `thresholds.ALARM`: add names one after the other (`search`), each fitted
 together with everything before it is added (`refits`). 4. Drop names that are not needed beside the others. 5. Names
 that leave a poor fit nearly as poor are reported as parts of the missing effect, and taken out again. 6. What no name
@@ -163,7 +163,7 @@ def diagnose(
         members=_members(first, state, steps),
         rounds=state.rounds,
         not_scored=_not_scored(catalogue, candidates, first.evidence.synonyms),
-        descriptions=len(candidates.sentences) + len(candidates.parts),
+        descriptions=len(candidates.descriptions) + len(candidates.parts),
     )
     tables = first.evidence.table, evidence.table
     rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))

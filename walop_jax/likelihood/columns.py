@@ -1,6 +1,6 @@
 """Responses of the residuals to small changes of an instrument: the columns of the score test, all from one program.
 
-A change is a sum of sentences (`model.effects.change`), with a coefficient each. Its column is the derivative of the
+A change is a sum of descriptions (`model.effects.change`), with a coefficient each. Its column is the derivative of the
 used residuals with respect to its amplitude, at neutral: its change of the light or of the analysis vectors
 (`model.slots`) meets the exposures, is multiplied by its factors, and the flux takes up its part.
 
@@ -42,8 +42,7 @@ from walop_jax.model import light, slots
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.effects.cameras import ADDED, Ghost
-from walop_jax.model.effects.change import KINDS, InExposures, NoSlotError, SlotTerm, product
-from walop_jax.model.effects.change import Change as Sentence
+from walop_jax.model.effects.change import KINDS, Change, InExposures, NoSlotError, SlotTerm, product
 from walop_jax.model.effects.optics import LARGEST_GAP
 from walop_jax.model.elements.wave_plate import AirGap, WavePlate
 from walop_jax.model.instrument import Instrument
@@ -53,8 +52,8 @@ from walop_jax.model.planning import plan_for
 from walop_jax.model.slots import LightSlopes, Slot, VectorSlopes
 from walop_jax.model.sources import ExposureArrays, PointIllumination
 
-SumOfSentences = Sequence[tuple[float, Sentence]]
-"""A sum of sentences with their coefficients."""
+SumOfChanges = Sequence[tuple[float, Change]]
+"""A sum of descriptions with their coefficients."""
 
 LEAST_SURVIVING = 1e-3  # a contrast of 1 % that the band reduces by this factor is 0.001 %: of no consequence
 CAMERAS = ("counts", "opposite", *ADDED)
@@ -63,11 +62,11 @@ GAPS_TOGETHER = 10  # thicknesses of air whose fringes are computed together, in
 
 
 def columns(
-    likelihood: Likelihood, values: Vector, changes: Sequence[SumOfSentences]
+    likelihood: Likelihood, values: Vector, changes: Sequence[SumOfChanges]
 ) -> Float[np.ndarray, "d a"]:
     """Derivatives of the used residuals (rows) with respect to the amplitudes of changes, at neutral.
 
-    `values` are all parameters of the model. Raises `NoSlotError` for a sentence that has no slots.
+    `values` are all parameters of the model. Raises `NoSlotError` for a description that has no slots.
     """
     return Columns(likelihood, values).of(changes)
 
@@ -223,13 +222,13 @@ class Columns:
         self.of_vectors, self.of_light = slots.vector_slots(self.patched), slots.light_slots(self.patched)
         self.exposures: ExposureArrays = jax.tree.map(np.asarray, self.plan.exposures)
         self.fringed = slots.fringe_places(self.patched)
-        self._known: dict[Sentence, list[SlotTerm]] = {}
+        self._known: dict[Change, list[SlotTerm]] = {}
         self.reader = dataclasses.replace(likelihood.points.reader, mirrored=True)
         self._responses: _AtPoint | None = None
         self._data: dict[int, PointData] = {}
         self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 
-    def has(self, change: SumOfSentences) -> bool:
+    def has(self, change: SumOfChanges) -> bool:
         """True if a change is a sum of slots to first order."""
         try:
             self.terms_of(change)
@@ -237,25 +236,25 @@ class Columns:
             return False
         return True
 
-    def terms_of(self, change: SumOfSentences) -> list[SlotTerm]:
-        """Slots of a change, coefficients and factors. Raises `NoSlotError` for a sentence that has no slots."""
+    def terms_of(self, change: SumOfChanges) -> list[SlotTerm]:
+        """Slots of a change, coefficients and factors. Raises `NoSlotError` for a description that has no slots."""
         terms = []
-        for size, sentence in change:
-            if sentence not in self._known:
-                self._known[sentence] = self._terms(sentence)
-            terms += [term._replace(size=size * term.size) for term in self._known[sentence]]
+        for size, description in change:
+            if description not in self._known:
+                self._known[description] = self._terms(description)
+            terms += [term._replace(size=size * term.size) for term in self._known[description]]
         return terms
 
-    def _terms(self, sentence: Sentence) -> list[SlotTerm]:
+    def _terms(self, description: Change) -> list[SlotTerm]:
         try:
-            terms = list(KINDS[sentence.kind].slots(self.patched, sentence))
+            terms = list(KINDS[description.kind].slots(self.patched, description))
         except NoSuchPlaceError as error:
             raise NoSlotError(str(error)) from None
         # Of the wavelengths in a band the light of an exposure has the mean.
         inside = (term.slot[0] != "light" and "colour" in term.factors for term in terms)
         if any(inside) or not all(self._holds(term.slot) for term in terms):
-            raise NoSlotError(sentence.text)
-        if sentence.kind != "thermal" or self.plan.conditions.holds("temperature"):
+            raise NoSlotError(description.text)
+        if description.kind != "thermal" or self.plan.conditions.holds("temperature"):
             return terms
         return [term._replace(factors=(*term.factors, "kelvin")) for term in terms]
 
@@ -352,18 +351,18 @@ class Columns:
             self._fringes[start, gaps] = joined
         return joined
 
-    def of(self, changes: Sequence[SumOfSentences]) -> Float[np.ndarray, "d a"]:
+    def of(self, changes: Sequence[SumOfChanges]) -> Float[np.ndarray, "d a"]:
         """The columns of changes: rows run over points, then exposures, then cameras, used ones only."""
         return self.rounded(changes, len(changes))[0]
 
     def rounded(
-        self, changes: Sequence[SumOfSentences], exact: int
+        self, changes: Sequence[SumOfChanges], exact: int
     ) -> tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]:
         """The columns of the first, `exact` changes, and those of the others in single precision."""
         return next(self.in_pieces(changes, exact, max(1, len(self.likelihood.used))))
 
     def in_pieces(
-        self, changes: Sequence[SumOfSentences], exact: int, points: int
+        self, changes: Sequence[SumOfChanges], exact: int, points: int
     ) -> Iterator[tuple[Float[np.ndarray, "d a"], Float[np.ndarray, "d b"]]]:
         """The same for so many points at a time (whole blocks of `limits.RESPONSES_TOGETHER`), one after the other."""
         changed_terms = [self.terms_of(change) for change in changes]

@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Float
 
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.columns import Columns, ResponseBlock, SumOfSentences
+from walop_jax.likelihood.columns import Columns, ResponseBlock, SumOfChanges
 from walop_jax.model.effects.change import InExposures, SlotTerm
 from walop_jax.model.effects.factors import FIELD, Units, factor
 from walop_jax.model.effects.optics import generator
 
 
 def added_to_starlight(
-    columns: Columns, changes: Sequence[SumOfSentences], exposure: int
+    columns: Columns, changes: Sequence[SumOfChanges], exposure: int
 ) -> tuple[Float[np.ndarray, "p k 3"], Float[np.ndarray, "p k 3 a"]]:
     """Analysis vectors at the field points in the setting of an exposure, and the part added by each change."""
     changed_terms = [columns.terms_of(change) for change in changes]

@@ -28,7 +28,7 @@ from walop_jax.fit.search import moved_within
 from walop_jax.io.errors import DataError, fail
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import engine
-from walop_jax.likelihood.columns import Columns, SumOfSentences
+from walop_jax.likelihood.columns import Columns, SumOfChanges
 from walop_jax.likelihood.inverses import pseudo_inverse
 from walop_jax.likelihood.likelihood import Likelihood, used_rows
 from walop_jax.model.effects import EFFECTS, EffectKind
@@ -96,7 +96,7 @@ def split(calset: CalibrationSet) -> Iterator[tuple[int, CalibrationSet]]:
 # ------------------------------------------------------------------------------------------------------ candidates
 
 
-CandidateTable = dict[str, tuple[Parameter, SumOfSentences]]
+CandidateTable = dict[str, tuple[Parameter, SumOfChanges]]
 """Amplitudes beyond a model by name, each with the change that it is to first order; a gauge has none."""
 
 

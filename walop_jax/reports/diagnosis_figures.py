@@ -100,13 +100,14 @@ def rms_figure(data: DiagnosisFigureData, on: Canvas = PAGE) -> AnyFigure:
 def signature_figure(
     comparison: ResidualComparison, exposures: FigureColumns, cameras: Sequence[str], on: Canvas = PAGE
 ) -> AnyFigure:
-    """Residuals averaged over the field, camera by camera: data as dots, the part of the effect as a line.
+    """Residuals averaged over the field, camera by camera: data as dots, the part of the effect (if any) as a line.
 
     Against the polariser angle where the comparison shows a harmonic of it, or most of its signal is behind the
     polariser; against time otherwise. Exposures at one angle are averaged. The lower panels hold the remaining
     residuals.
     """
     angular, position, label = _abscissa(comparison, exposures)
+    changed = bool(np.nan_to_num(comparison.curves["EXPLAINED"]).any())
     grid = {"sharex": True, "sharey": "row", "height_ratios": (2.2, 1)}
     figure, (upper, lower) = on.panels(0.6 + 2.0 * len(cameras), 3.5, 2, len(cameras), **grid)
     for k, camera in enumerate(cameras):
@@ -117,7 +118,8 @@ def signature_figure(
         for axis, dots in ((upper[k], before), (lower[k], after)):
             axis.axhline(0.0, color=style.QUIET, lw=0.8, zorder=0)
             axis.errorbar(x, dots, error, fmt="o", ms=3, lw=0.8, color="0.15", label="data", zorder=3)
-        upper[k].plot(x, explained, color=style.BEFORE, lw=1.4, label="effect", zorder=2)
+        if changed:
+            upper[k].plot(x, explained, color=style.BEFORE, lw=1.4, label="effect", zorder=2)
         upper[k].set_title(camera)
         lower[k].set_xlabel(label)
         if angular:

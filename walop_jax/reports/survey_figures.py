@@ -29,7 +29,7 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -
     """The parameters that change (`tracked`, one at least), against time.
 
     The band is the value under the law with its error, dots the value of each night alone. A step is a step:
-    grey across is the time in which it can have been; dashed lines are other breaks of that parameter, dotted ones the
+    grey across is the time in which it can have been; dashed lines are bad nights of that parameter, dotted ones the
     events that the user wrote down.
     """
     broken, names = document["breaks"], tracked(document)
@@ -54,12 +54,20 @@ def tracks_figure(tracks: Any, document: Mapping[str, Any], on: Canvas = PAGE) -
             if entry["kind"] == "step":
                 axis.axvspan(*day_of([entry["before"], entry["after"]]), color=QUIET, lw=0, zorder=0)
             else:
-                axis.axvline(float(day_of(entry["before"])), color=BEFORE, lw=0.9, ls="--")
+                axis.axvline(float(day_of(_night_of(entry, rows))), color=BEFORE, lw=0.9, ls="--")
         _events(axis, document["events"])
         unit = unit_in_words(str(rows["UNIT"][0])) if len(rows) else ""
         axis.set_ylabel(f"{name}\n{f'({unit})' if unit else ''}".strip(), fontsize=SMALL)
     calendar(axes[-1, 0], tracks["MJD"])
     return figure
+
+
+def _night_of(bad_night: Mapping[str, Any], rows: Any) -> float:
+    """MJD of a bad night in the rows of a parameter; the middle of its time where these do not have its number."""
+    numbers = np.asarray(rows["NIGHT"]) == bad_night["night"]
+    if not numbers.any():
+        return 0.5 * (bad_night["before"] + bad_night["after"])
+    return float(np.asarray(rows["MJD"], float)[numbers][0])
 
 
 @styled

@@ -35,7 +35,7 @@ from walop_jax.data.records import Block, CalibrationSet, Points  # noqa: E402
 from walop_jax.data.table_intensities import TableIntensities  # noqa: E402
 from walop_jax.diagnosis.design import Measured, strata  # noqa: E402
 from walop_jax.diagnosis.examination import Examination, examine  # noqa: E402
-from walop_jax.diagnosis.hypotheses import Hypotheses, all_candidates, sentences_of  # noqa: E402
+from walop_jax.diagnosis.hypotheses import Hypotheses, all_candidates, texts_of  # noqa: E402
 from walop_jax.diagnosis.score import ABSORBED, FAINTEST  # noqa: E402
 from walop_jax.fit.refit import FitResult  # noqa: E402
 from walop_jax.likelihood.columns import Columns  # noqa: E402
@@ -84,7 +84,7 @@ class Layout:
         def examined(result: FitResult, hypotheses: Hypotheses, rng: np.random.Generator) -> Examination:
             """With the columns of all exposures that were taken: the one before may be kept back."""
             columns = Columns(Likelihood.of(whole, result.model), result.values)
-            asked = all_candidates(columns, [*hypotheses.names, *hypotheses.sentences])
+            asked = all_candidates(columns, [*hypotheses.names, *hypotheses.descriptions])
             self.columns = {name: one.columns for name, one in asked.items()}
             inside = {
                 n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in asked.items()
@@ -149,8 +149,8 @@ def hidden(
     blind.rng = np.random.default_rng([seed, 33])
     single = {
         text: column
-        for probe in blind.sentences
-        for text, column in zip(sentences_of(probe), named[probe.name].T, strict=True)
+        for probe in blind.descriptions
+        for text, column in zip(texts_of(probe), named[probe.name].T, strict=True)
     }
     nothing = np.zeros(len(layout.design.residual)), np.zeros(int((~layout.inside).sum()))
     for _ in range(nulls):
@@ -171,7 +171,7 @@ def hidden(
                 continue
             rows, beyond = layout.projected(-named[drawn.probe] @ drawn.amplitudes[:, None])
             size = ratio / np.linalg.norm(rows)
-            said = tuple(sorted(blind.in_sentences[drawn.probe]))
+            said = tuple(sorted(blind.as_descriptions[drawn.probe]))
             yield Hidden("left out", name, ratio, said, name, size * rows[:, 0], size * beyond[:, 0])
 
 
@@ -183,14 +183,14 @@ def _shapes(
         yield from new_shapes(layout.whole, single, seed)
         return
     for name, column in outside(layout.whole, single):
-        yield name, tuple(sorted(layout.blind.in_sentences[name])), column
+        yield name, tuple(sorted(layout.blind.as_descriptions[name])), column
 
 
 def grammar(layout: Layout) -> dict[str, np.ndarray]:
     """The columns of everything that can be said, behind the base, candidate by candidate."""
     measured, blind, named = layout.whole, layout.blind, layout.columns
     groups = [(p.name, p.effect.name, named[p.name], p.widths, "effect") for p in blind.probes]
-    groups += [(p.name, "", named[p.name], p.widths, "sentence") for p in blind.sentences]
+    groups += [(p.name, "", named[p.name], p.widths, "sentence") for p in blind.descriptions]
     for stratum in strata(measured):
         pattern = measured.candidate(stratum)
         groups.append((pattern.name, "", pattern.columns, pattern.widths, "pattern"))

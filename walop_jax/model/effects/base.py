@@ -201,7 +201,7 @@ class Effect(Component):
         """Discrete choices of the effect, e.g. the number of a camera."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata.get("static")}
 
-    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+    def as_descriptions(self, instrument: Instrument) -> tuple[str, ...]:
         """Descriptions of the changes whose sum, to first order, is the effect in an instrument."""
         return self.said
 

@@ -265,7 +265,7 @@ class Named(Effect):
             for combination in self._parts(member, instrument)
         )
 
-    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+    def as_descriptions(self, instrument: Instrument) -> tuple[str, ...]:
         """The changes in the grammar of a diagnosis."""
         return tuple(
             _behind(Change.parsed(text), instrument).text

@@ -70,7 +70,7 @@ class Etalon(Effect):
         shift = np.arctan2(sine, cosine) * quarter / (0.5 * np.pi)
         return dataclasses.replace(group[0], contrast=np.hypot(cosine, sine), gap=float(group[0].gap) + shift)
 
-    def in_sentences(self, instrument: Instrument) -> tuple[str, ...]:
+    def as_descriptions(self, instrument: Instrument) -> tuple[str, ...]:
         """Fringes of every plate, of the gap itself and of one a quarter of a fringe wider."""
         gaps = (float(self.gap), float(self.gap) + instrument.units.wavelength / 8.0)
         return tuple(f"fringes of {p} * gap {gap:g}" for p in instrument.places(WavePlate) for gap in gaps)

@@ -104,8 +104,8 @@ def with_effects(
     return dataclasses.replace(model, template=jax.tree.map(array, instrument), parameters=tuple(parameters))
 
 
-def with_sentences(model: Model, description: Described, data: Context | CalibrationSet) -> Model:
-    """The model with further sentences; those that it has keep their parameters."""
+def with_descriptions(model: Model, description: Described, data: Context | CalibrationSet) -> Model:
+    """The model with further descriptions; those that it has keep their parameters."""
     if Described.name not in model.effect_names:
         return with_effects(model, [description], data)
     earlier = model.template.effect(Described.name)
