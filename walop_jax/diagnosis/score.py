@@ -344,14 +344,18 @@ class ScoreSpace:
 
     def smallest_of(self, drawn: Float[np.ndarray, "a d"]) -> AnyVector:
         """ln of the smallest p among all candidates in each draw of the scores C̃ᵀr, for noise of unit size."""
-        smallest = np.zeros(drawn.shape[1])
+        largest: dict[int, AnyVector] = {}  # statistic of all candidates of a rank: p falls with it
         for name, at in self.places().items():
             w = self.whitened[name]
-            if w.shape[1]:
-                statistic = np.sum((w.T @ np.where(self.alive[at][:, None], drawn[at], 0.0)) ** 2, axis=0)
-                # Millions of values, 10⁻⁴ is plenty.
-                log_p = np.interp(statistic, *_survival_grid(w.shape[1]))
-                np.minimum(smallest, log_p, out=smallest)
+            if rank := w.shape[1]:
+                along = w.T @ np.where(self.alive[at][:, None], drawn[at], 0.0)
+                statistic = np.einsum("kd,kd->d", along, along)
+                best = largest.setdefault(rank, statistic)
+                np.maximum(best, statistic, out=best)
+        # Millions of values, 10⁻⁴ is plenty.
+        smallest = np.zeros(drawn.shape[1])
+        for rank, statistic in largest.items():
+            np.minimum(smallest, np.interp(statistic, *_survival_grid(rank)), out=smallest)
         return smallest
 
 
@@ -519,19 +523,23 @@ class _Root:
             scaled, tol=ROOT_TOLERANCE, overwrite_a=True
         )
         order = nonzero[pivots - 1]
-        self._chosen = order[: self.rank]
+        self._chosen, beyond = order[: self.rank], order[self.rank :]
         self._first = np.triu(factor[: self.rank, : self.rank]).T * norm[self._chosen, None]
         root = np.empty((len(nonzero), self.rank), np.float32)
         root[pivots[: self.rank] - 1] = self._first
-        beyond = order[self.rank :]
-        root[pivots[self.rank :] - 1] = factor[: self.rank, self.rank :].T * norm[beyond, None]
+        for first in range(0, len(beyond), limits.COLUMNS_TOGETHER):
+            at = slice(first, first + limits.COLUMNS_TOGETHER)
+            part = factor[: self.rank, self.rank :][:, at].T * norm[beyond[at], None]
+            root[pivots[self.rank :][at] - 1] = part
+        del scaled, factor  # the largest matrix: what is left to be done needs a copy of the root
         self.whole = np.zeros((len(norm), self.rank), np.float32)
         scale = (
             whole.factor[every] / whole.factor[nonzero][of]
             if isinstance(whole, Repeated)
             else np.ones(len(of))
         )
-        self.whole[every] = root[of] * scale[:, None].astype(np.float32)
+        self.whole[every] = root[of]
+        self.whole[every] *= scale[:, None].astype(np.float32)
 
     def explained(self, scores: AnyVector) -> float:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""

@@ -67,8 +67,8 @@ from walop_jax.model.effects.in_models import known_effects
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
-POINTS_TOGETHER = 64  # field points whose columns are made together: 70 MB of 4000 at 16 exposures
-MULTIPLIED = 4e6  # of those that are multiplied together: 32 MB
+POINTS_TOGETHER = 48  # field points whose columns are made together: 50 MB of 4000 at 16 exposures
+MULTIPLIED = 2e6  # numbers of those that are multiplied together: 16 MB
 MADE_OF_N = (
     "{} holds the noise of N: SKY is proportional to N, so it is no level of the sky, and what is left of that in the "
     "counts was not asked; give the level that was subtracted, or leave SKY out"
@@ -120,6 +120,8 @@ def examined(
     if near:
         singles = Singles.of(design)
         hidden = undetected_errors(design, singles)
+        candidates = candidates or candidate_scores(design, seed, singles)
+        design.columns.forget()  # responses of a thousand points, ahead of the large matrices of the patterns
         doubts = (
             *stated_conditions(design, singles),
             *_significant(
@@ -127,10 +129,7 @@ def examined(
                 pattern_scores(design, seed),
                 result.model.template.cameras.names,
             ),
-            *_significant(
-                "are explained better by a missing effect",
-                candidates or candidate_scores(design, seed, singles),
-            ),
+            *_significant("are explained better by a missing effect", candidates),
             *in_words(components),
             *_groups(design),
             *repeated_noise(design),
@@ -176,17 +175,18 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
         rows = slice(first, first := first + design.measured.cameras * int(used[points].sum()))
         shown = [probe for probe in probes if probe.name in known or probe.name in made]
         for group in _in_groups(shown, MULTIPLIED / max(1, rows.stop - rows.start)):
-            columns = [
-                known[p.name][rows]
-                if p.name in known
-                else made[p.name].columns.astype(float) / fit.noise_scale
-                for p in group
-            ]
-            joined = np.concatenate(columns, axis=1)
+            joined = np.empty((sum(len(p.widths) for p in group), rows.stop - rows.start)).T
+            places, last = list[slice](), 0
+            for p in group:
+                places.append(at := slice(last, last := last + len(p.widths)))
+                if p.name in known:
+                    joined[:, at] = known[p.name][rows]
+                else:
+                    np.divide(made[p.name].columns, fit.noise_scale, out=joined[:, at], dtype=float)
             along, scores = basis[rows].T @ joined, joined.T @ residual[rows]
-            drawn, last = joined.T.astype(np.float32) @ normal[rows], 0
-            for p, c in zip(group, columns, strict=True):
-                at = slice(last, last := last + c.shape[1])
+            drawn = joined.T.astype(np.float32) @ normal[rows]
+            for p, at in zip(group, places, strict=True):
+                c = joined[:, at]
                 products = _Products(c.T @ c, along[:, at], scores[at], drawn[at])
                 sums[p.name] = products if p.name not in sums else sums[p.name].plus(products)
     scored = [probe for probe in probes if probe.name in sums]

@@ -198,7 +198,7 @@ _at_points = compiled(_at_each, optimised_above=limits.SELDOM_OPTIMISED_ABOVE, k
 _at_sites = jax.vmap(slots.fringe_slopes, (None, None, None, 0, 0))
 _fringes_at = compiled(
     jax.vmap(_at_sites, (None, None, None, 0, 0)),
-    optimised_above=limits.SELDOM_OPTIMISED_ABOVE,
+    optimised_above=limits.OPTIMISED_ABOVE,
     kept_as="fringes",
 )
 _mean_wavelengths = compiled(
@@ -224,7 +224,8 @@ class Columns:
         self.fringed = slots.fringe_places(self.patched)
         self._known: dict[Change, list[SlotTerm]] = {}
         self.reader = dataclasses.replace(likelihood.points.reader, mirrored=True)
-        self._responses: dict[int, tuple[PointData, _AtPoint]] = {}
+        self._responses: _AtPoint | None = None
+        self._data: dict[int, PointData] = {}
         self._fringes: dict[tuple[int, tuple[float, ...]], Float[np.ndarray, "p m w g b k 4"]] = {}
 
     def has(self, change: SumOfChanges) -> bool:
@@ -280,7 +281,8 @@ class Columns:
         gap = AirGap(0.0, 1.0, LARGEST_GAP)  # pyright: ignore[reportArgumentType]
         for place in patched.places(WavePlate):
             patched = patched.changed(place, air_gaps=lambda gaps: (*gaps, gap))
-        return plan_for(patched, calset.exposures, calset.filters, calset.sources)
+        plan = plan_for(patched, calset.exposures, calset.filters, calset.sources)
+        return dataclasses.replace(plan, work=self.plan.work)
 
     @functools.cached_property
     def wavelength(self) -> Float[np.ndarray, " b"]:
@@ -303,15 +305,36 @@ class Columns:
         return median_over_field(np.where(used, counts - residual / np.where(used, weight, 1.0), np.nan))
 
     def responses(self, start: int) -> tuple[PointData, _AtPoint]:
-        """Data and responses of `limits.RESPONSES_TOGETHER` points from `start` on, kept if the set is small."""
-        if start in self._responses:
-            return self._responses[start]
+        """Data and responses of `limits.RESPONSES_TOGETHER` points from `start` on, kept if the set is small.
+
+        Those that are kept lie in one array for all points, whose memory goes back to the system as a whole.
+        """
+        if start in self._data:
+            return self._data[start], self._kept_at(start)
         size = limits.RESPONSES_TOGETHER
         (data,) = self.reader.batches(start, start + size, size)
-        response = data, jax.tree.map(np.asarray, _at_points(self.instrument, self.plan, data))
-        if len(self.likelihood.used) <= limits.RESPONSES_KEPT:
-            self._responses[start] = response
-        return response
+        response = jax.tree.map(np.asarray, _at_points(self.instrument, self.plan, data))
+        points = len(self.likelihood.used)
+        if points > limits.RESPONSES_KEPT:
+            return data, response
+        if self._responses is None:
+            rows = -(-points // size) * size
+            self._responses = jax.tree.map(lambda leaf: np.empty((rows, *leaf.shape[1:])), response)
+        self._data[start] = data
+        for kept, leaf in zip(*map(jax.tree.leaves, (self._kept_at(start), response)), strict=True):
+            kept[...] = leaf
+        return data, self._kept_at(start)
+
+    def _kept_at(self, start: int) -> _AtPoint:
+        """The responses that are kept of the points from `start` on."""
+        rows = slice(start, start + limits.RESPONSES_TOGETHER)
+        return jax.tree.map(lambda leaf: leaf[rows], self._responses)
+
+    def forget(self) -> None:
+        """Give back the memory of all responses; they are computed anew where they are asked for again."""
+        self._responses = None
+        self._data.clear()
+        self._fringes.clear()
 
     def fringes(
         self, start: int, gaps: tuple[float, ...], x: Vector, y: Vector, sites: int
@@ -324,7 +347,7 @@ class Columns:
         batches = padded.reshape(-1, GAPS_TOGETHER)
         slopes = [_fringes_at(self.instrument, self.fringe_plan, batch, *at) for batch in batches]
         joined = np.concatenate(slopes, axis=3)[:, :, :, : len(gaps)]
-        if len(self.likelihood.used) <= limits.RESPONSES_KEPT:
+        if len(self.likelihood.used) <= limits.FRINGES_KEPT:
             self._fringes[start, gaps] = joined
         return joined
 

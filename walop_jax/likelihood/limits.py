@@ -28,8 +28,11 @@ RESPONSES_TOGETHER = 16
 RESPONSES_AT_ONCE = 4
 """Those of them that are worked on at a time: their derivatives stay in the processor's cache, and take two fifths of
 the time."""
-RESPONSES_KEPT = 1024
-"""Largest number of field points whose responses are kept for further columns: 200 MB."""
+RESPONSES_KEPT = 1280
+"""Largest number of field points whose responses are kept for further columns: 250 MB. A verdict looks at so many in 16
+exposures, three times."""
+FRINGES_KEPT = 256
+"""The same for slopes in the fringes of air, which one list of candidates asks for once: 100 KB a point."""
 RESPONSE_NUMBERS = 4_000_000
 """Numbers of responses that meet the exposures of some points together: 32 MB."""
 
