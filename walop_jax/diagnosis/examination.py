@@ -291,14 +291,29 @@ class Examination(Evidence):
 
     @cached_property
     def smooth(self) -> SmoothFields | None:
-        """Smooth fields with their scores, made when they are first asked for; None of a set with too few points."""
-        columns = self.design.columns
-        fields = [f for f in self.fields if all(columns.has([(1.0, change)]) for change in f.changes)]
+        """Smooth fields with their scores, made when they are first asked for; None of a set with too few points.
+
+        Where gradients over the field at two places are the same change (`synonyms`), smooth fields there are as well.
+        """
+        columns, by_gradient = self.design.columns, {field.gradient: field for field in self.fields}
+        also = {
+            by_gradient[name].name: tuple(by_gradient[other].name for other in others if other in by_gradient)
+            for name, others in self.synonyms.items()
+            if name in by_gradient
+        }
+        said = set(itertools.chain(*also.values()))
+        fields = [
+            field
+            for field in self.fields
+            if field.name not in said and all(columns.has([(1.0, change)]) for change in field.changes)
+        ]
         if not fields:
             return None
         context = effect_context(self.result.model.template, self.result.calset.exposures)
         basis = np.hstack([self.design.projector.basis, self._of_single_exposures()])
-        return SmoothFields(self.design, fields, context, basis)
+        return SmoothFields(
+            self.design, fields, context, basis, {n: names for n, names in also.items() if names}
+        )
 
     def _of_single_exposures(self) -> AnyMatrix:
         """Columns Z of which Z Zᵀ is what the disturbances of single exposures take up, behind the free parameters."""

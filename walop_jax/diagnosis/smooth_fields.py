@@ -17,7 +17,7 @@ Limits      Ghosts of the model, 10⁻³ of the light, carry the pattern of the 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -36,13 +36,14 @@ from walop_jax.model.effects.factors import SMOOTH_DEGREE, smooth_deviations
 class SmoothFields:
     """The smooth fields that a fit may lack, with their products behind the free parameters.
 
-    `basis` are the columns of B (module docstring), by rows of data and priors.
+    `basis` are the columns of B (module docstring), by rows of data and priors, `synonyms` other names of candidates.
     """
 
     design: Design
     fields: Sequence[SmoothField]
     context: Context
     basis: AnyMatrix
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     def behind(self, columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
         """What neither the free parameters nor the disturbances of single exposures take up of columns, by rows."""
