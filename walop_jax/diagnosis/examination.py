@@ -389,20 +389,21 @@ def examine(
     rng: np.random.Generator,
     earlier: Examination | None = None,
     *,
+    computed: Mapping[str, Candidate] | None = None,
     synonyms_apart: bool = False,
 ) -> Examination:
     """Score effects that a model has not, descriptions and patterns against a fit.
 
     Descriptions that say what another candidate says are names of that one (`synonyms`); with `synonyms_apart`, for
     studies, each is a candidate of its own. `earlier` is of a smaller model: its names hold here, and its columns serve
-    again where the light has hardly changed.
+    again where the light has hardly changed. `computed` are effects and descriptions with columns that exist already.
     """
     active, design = result.model.effect_names, Design.of(result)
     known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
     again = earlier if earlier is not None and earlier.is_like(design) else None
     if again is not None:
         computed = again.candidates
-    else:
+    elif computed is None:
         other_names = set(itertools.chain(*(known or {}).values()))
         wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
         computed = all_candidates(design.columns, wanted)
