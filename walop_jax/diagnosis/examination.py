@@ -310,9 +310,9 @@ class Examination(Evidence):
         if not fields:
             return None
         context = effect_context(self.result.model.template, self.result.calset.exposures)
-        basis = np.hstack([self.design.projector.basis, self._of_single_exposures()])
+        bases = self.design.projector.basis, self._of_single_exposures()
         return SmoothFields(
-            self.design, fields, context, basis, {n: names for n, names in also.items() if names}
+            self.design, fields, context, bases, {n: names for n, names in also.items() if names}
         )
 
     def _of_single_exposures(self) -> AnyMatrix:
