@@ -445,11 +445,13 @@ def examine(
     if SINGLE_EXPOSURES in names:
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode(bare, design))
         scores, square = reduce(scores, square)
+    table = space.table(scores, square, space.smallest_p(rng))
+    space.forget()
     return Examination(
         space=space,
         scores=scores,
         square=square,
-        table=space.table(scores, square, space.smallest_p(rng)),
+        table=table,
         probes=probes,
         descriptions=descriptions,
         parts=parts,
