@@ -192,7 +192,7 @@ ERRORS = (
             "diagnosis/test_smooth_fields.py"),
     planted("diagnosis/smooth_fields.py", "legendre.basis(points.x, points.y,", "legendre.basis(points.y, points.x,",
             "diagnosis/test_smooth_fields.py"),
-    planted("model/effects/factors.py", "(np.arange(SMOOTH_DEGREE + 1) + 0.5) ** 2", "(np.arange(SMOOTH_DEGREE + 1) + 0.5)",
+    planted("model/effects/factors.py", "+ 0.5) ** 2", "+ 0.5)",
             "diagnosis/test_smooth_fields.py"),
     planted("model/effects/change.py", "math.sqrt(2.0 * degree + 1.0)", "(2.0 * degree + 1.0)",
             "diagnosis/test_smooth_fields.py"),
