@@ -1,24 +1,28 @@
 """Smooth fields: their prior against draws of the process, their products against columns that are written out."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_run import SMALL
 
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.grammar import hypotheses
-from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.diagnosis.hypotheses import Hypotheses, SmoothField
+from walop_jax.diagnosis.score import SCALES
 from walop_jax.diagnosis.selection import JointScores
+from walop_jax.diagnosis.smooth_fields import SmoothFields
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
 from walop_jax.likelihood.columns import own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
-from walop_jax.model.effects import Described
+from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.factors import SMOOTH_DEGREE, SMOOTH_LENGTH, smooth_deviations
 from walop_jax.model.effects.in_models import known_effects
@@ -71,6 +75,84 @@ def examined():
     listed = hypotheses(known_effects(model), model.template, calset.exposures, len(calset.points))
     few = Hypotheses(listed.names[:4], listed.descriptions[:60], (), listed.effects, (), listed.smooth)
     return examine(result, few, np.random.default_rng(0))
+
+
+class Points:
+    """Field points of a design made of random numbers."""
+
+    def __init__(self, x, y):
+        self.x, self.y = x, y
+
+    def __len__(self):
+        return len(self.x)
+
+
+def made_up(rng):
+    """Smooth fields of three changes beside random columns, parameters and residuals; and the matrices behind them."""
+    x, y = rng.uniform(-0.3, 0.3, (2, 5))
+    point = np.repeat(np.arange(5), (4, 8, 4, 12, 4))
+    rows, priors = len(point), 3
+    columns = rng.standard_normal((rows, 3)).astype(np.float32)
+    basis = np.linalg.qr(rng.standard_normal((rows + priors, 6)))[0]
+    residual = rng.standard_normal(rows + priors)
+    design = object.__new__(Design)
+    vars(design).update(
+        columns=SimpleNamespace(rounded=lambda changes, exact: (None, columns)),
+        point=point,
+        residual=residual,
+        projector=SimpleNamespace(free=rows - 6),
+        fit=SimpleNamespace(
+            noise_scale=2.0,
+            calset=SimpleNamespace(points=Points(x, y)),
+            model=SimpleNamespace(template=SimpleNamespace(units=SimpleNamespace(field=0.3))),
+        ),
+    )
+    changes = [Change.parsed(text) for text in ("gain of O1 * hours", "turn of polariser", "gain of E2")]
+    fields = [SmoothField((changes[0],), False), SmoothField(tuple(changes[1:]), False)]
+    smooth = SmoothFields(design, fields, Context(), (basis[:, :4], 0.5 * basis[:, 4:]))
+    value = [
+        np.polynomial.legendre.Legendre.basis(i)(x / 0.3) * np.polynomial.legendre.Legendre.basis(j)(y / 0.3)
+        for i, j in legendre.terms(SMOOTH_DEGREE)
+    ]
+    sigma = [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(SMOOTH_DEGREE)]
+    terms = (np.array(value).T * sigma)[point]
+    written = np.hstack([columns[:, k, None].astype(float) / 2.0 * terms for k in range(3)])
+    written = np.vstack([written, np.zeros((priors, written.shape[1]))])
+    both = np.hstack(smooth.bases)
+    return smooth, written, written - both @ (both.T @ written)
+
+
+def test_products_of_random_columns_are_those_of_columns_written_out():
+    """Gram matrices, scores and products with other columns, term by term, by plain matrix algebra."""
+    smooth, written, behind = made_up(np.random.default_rng(4))
+    count = len(legendre.terms(SMOOTH_DEGREE))
+    for gram, at in zip(smooth.grams, (slice(count), slice(count, 3 * count)), strict=True):
+        # A disturbance with a prior takes up a part: CᵀC − (CᵀB)(CᵀB)ᵀ.
+        assert np.allclose(gram, written[:, at].T @ behind[:, at], atol=1e-5)
+    assert np.allclose(smooth.scores, behind.T @ smooth.design.residual, atol=1e-5)
+    assert np.allclose(smooth.products(behind[: len(smooth.design.point)]), written.T @ behind, atol=1e-5)
+    assert np.allclose(
+        smooth.columns(smooth.names[1]), written[: len(smooth.design.point), count:], atol=1e-5
+    )
+    assert np.allclose(smooth.behind(written[: len(smooth.design.point)]), behind[: len(smooth.design.point)])
+
+
+def test_a_smooth_field_is_fitted_with_the_most_probable_scale_of_its_prior():
+    """Scale and amplitudes against densities of the residuals, and ridge regression, on columns written out."""
+    smooth, written, behind = made_up(np.random.default_rng(5))
+    name, count, noise = smooth.names[0], len(legendre.terms(SMOOTH_DEGREE)), 0.7
+    item = smooth.ranked(name, noise)
+    c, residual, widths = written[:, :count], smooth.design.residual, item.probe.widths
+    information, pull = c.T @ behind[:, :count] / noise**2, behind[:, :count].T @ residual / noise**2
+
+    def log_density(t):
+        matrix = np.linalg.inv(information + np.diag((t * widths) ** -2.0))
+        determinant = np.linalg.slogdet(np.eye(count) + np.outer(t * widths, t * widths) * information)[1]
+        return 0.5 * pull @ matrix @ pull - 0.5 * determinant
+
+    assert item.scale == max(SCALES, key=log_density)
+    expected = -np.linalg.solve(information + np.diag((item.scale * widths) ** -2.0), pull)
+    assert np.allclose(item.score.amplitudes, expected, atol=1e-4 * np.abs(expected).max())
 
 
 PLACES = (

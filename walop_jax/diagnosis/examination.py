@@ -291,14 +291,29 @@ class Examination(Evidence):
 
     @cached_property
     def smooth(self) -> SmoothFields | None:
-        """Smooth fields with their scores, made when they are first asked for; None of a set with too few points."""
-        columns = self.design.columns
-        fields = [f for f in self.fields if all(columns.has([(1.0, change)]) for change in f.changes)]
+        """Smooth fields with their scores, made when they are first asked for; None of a set with too few points.
+
+        Where gradients over the field at two places are the same change (`synonyms`), smooth fields there are as well.
+        """
+        columns, by_gradient = self.design.columns, {field.gradient: field for field in self.fields}
+        also = {
+            by_gradient[name].name: tuple(by_gradient[other].name for other in others if other in by_gradient)
+            for name, others in self.synonyms.items()
+            if name in by_gradient
+        }
+        said = set(itertools.chain(*also.values()))
+        fields = [
+            field
+            for field in self.fields
+            if field.name not in said and all(columns.has([(1.0, change)]) for change in field.changes)
+        ]
         if not fields:
             return None
         context = effect_context(self.result.model.template, self.result.calset.exposures)
-        basis = np.hstack([self.design.projector.basis, self._of_single_exposures()])
-        return SmoothFields(self.design, fields, context, basis)
+        bases = self.design.projector.basis, self._of_single_exposures()
+        return SmoothFields(
+            self.design, fields, context, bases, {n: names for n, names in also.items() if names}
+        )
 
     def _of_single_exposures(self) -> AnyMatrix:
         """Columns Z of which Z Zᵀ is what the disturbances of single exposures take up, behind the free parameters."""
@@ -374,20 +389,21 @@ def examine(
     rng: np.random.Generator,
     earlier: Examination | None = None,
     *,
+    computed: Mapping[str, Candidate] | None = None,
     synonyms_apart: bool = False,
 ) -> Examination:
     """Score effects that a model has not, descriptions and patterns against a fit.
 
     Descriptions that say what another candidate says are names of that one (`synonyms`); with `synonyms_apart`, for
     studies, each is a candidate of its own. `earlier` is of a smaller model: its names hold here, and its columns serve
-    again where the light has hardly changed.
+    again where the light has hardly changed. `computed` are effects and descriptions with columns that exist already.
     """
     active, design = result.model.effect_names, Design.of(result)
     known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
     again = earlier if earlier is not None and earlier.is_like(design) else None
     if again is not None:
         computed = again.candidates
-    else:
+    elif computed is None:
         other_names = set(itertools.chain(*(known or {}).values()))
         wanted = [probe for probe in hypotheses.beside(active) if probe.name not in other_names]
         computed = all_candidates(design.columns, wanted)
@@ -429,11 +445,13 @@ def examine(
     if SINGLE_EXPOSURES in names:
         space, reduce = bare.with_base([SINGLE_EXPOSURES], common_mode(bare, design))
         scores, square = reduce(scores, square)
+    table = space.table(scores, square, space.smallest_p(rng))
+    space.forget()
     return Examination(
         space=space,
         scores=scores,
         square=square,
-        table=space.table(scores, square, space.smallest_p(rng)),
+        table=table,
         probes=probes,
         descriptions=descriptions,
         parts=parts,

@@ -104,17 +104,21 @@ class SmoothField(NamedTuple):
     @property
     def name(self) -> str:
         """The names of its changes, with `smooth` as the pattern over the field."""
-        return "; ".join(dict.fromkeys(self._term(change, 0, 0).candidate for change in self.changes))
+        return "; ".join(dict.fromkeys(self._with(change, "field 0 0").candidate for change in self.changes))
 
-    def _term(self, change: Change, i: int, j: int) -> Change:
-        pattern = (f"field {i} {j}",)
-        factors = (*pattern, *change.factors) if self.pattern_first else (*change.factors, *pattern)
+    @property
+    def gradient(self) -> str:
+        """The name of the description that has a gradient over the field in the place of the smooth field."""
+        return "; ".join(self._with(change, along).text for change in self.changes for along in ("x", "y"))
+
+    def _with(self, change: Change, pattern: str) -> Change:
+        factors = (pattern, *change.factors) if self.pattern_first else (*change.factors, pattern)
         return dataclasses.replace(change, factors=factors)
 
     def probe(self, context: Context) -> Probe:
         """The candidate, its amplitudes change by change, and term by term of each."""
-        terms = legendre.terms(SMOOTH_DEGREE)
-        texts = tuple(self._term(change, i, j).text for change in self.changes for i, j in terms)
+        terms = [f"field {i} {j}" for i, j in legendre.terms(SMOOTH_DEGREE)]
+        texts = tuple(self._with(change, term).text for change in self.changes for term in terms)
         return Probe(self.name, Described, (Described.of(context, sentences=texts),), context)
 
 

@@ -297,6 +297,10 @@ class ScoreSpace:
     def _root(self) -> _Root:
         return _Root(self.gram, self.alive)
 
+    def forget(self) -> None:
+        """Give back the memory of the root of the Gram matrix, which nothing but `table` and `smallest_p` asks for."""
+        vars(self).pop("_root", None)
+
     def table_after(self, earlier: ScoreTable, scores: AnyVector) -> ScoreTable:
         """The table of a space that is part of an earlier one, with the noise and the number of trials found there."""
         noise, trials = earlier.noise_scale, earlier.trials

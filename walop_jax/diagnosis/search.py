@@ -350,10 +350,11 @@ def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: 
     nameless = tuple(name for name in names if name not in effects)[: thresholds.MOST_CLASSES]
     probes = {trial.name: "" if trial.item is None else trial.item.probe.name} | {n: n for n in nameless}
     logs = {name: float(np.log(max(value, 1e-300))) for name, value in linear.items()} | worth
+    also = {**evidence.synonyms, **({} if evidence.smooth is None else evidence.smooth.synonyms)}
     return dataclasses.replace(
         trial,
         rivals=tuple(name for name in names if name in effects),
         nameless=nameless,
-        synonyms={n: evidence.synonyms[probe] for n, probe in probes.items() if probe in evidence.synonyms},
+        synonyms={name: also[probe] for name, probe in probes.items() if probe in also},
         probability=float(np.exp(worth[trial.name] - np.logaddexp.reduce(list(logs.values())))),
     )

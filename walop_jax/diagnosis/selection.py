@@ -177,9 +177,17 @@ class JointScores:
         for chosen, at, gram in self._blocks:
             size = at.shape[1]
             left, s = gram - along[at] @ along[at].swapaxes(1, 2), scores[at]
+            # Below the root of 1 + t² G that of a matrix with t s for its last row has the part of s that is explained.
+            whole, inside = (
+                np.empty((len(chosen), size + 1, size + 1)),
+                (slice(None), slice(size), slice(size)),
+            )
             for column, t in enumerate(SCALES[: 1 if size == 1 else None]):
-                root = np.linalg.cholesky(np.eye(size) + t**2 * left)
-                pull = np.linalg.solve(root, t * s[..., None])[..., 0]
+                whole[inside] = np.eye(size) + t**2 * left
+                whole[:, size, :size] = whole[:, :size, size] = t * s
+                whole[:, size, size] = 1.0 + t**2 * np.sum(s**2, axis=1)
+                below = np.linalg.cholesky(whole)
+                root, pull = below[inside], below[:, size, :size]
                 log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
                 found[chosen, column] = 0.5 * np.sum(pull**2, axis=1) - log_root
                 if (one_sided := self.one_sided[at]).any():

@@ -7,8 +7,8 @@ term is that of the same change without a pattern, times the values of the term 
 Equation    C_{cf} = c F_f,   C_{cf}ᵀ V = Σ_p F_pf (c_pᵀ V_p)
             and behind the free parameters and the disturbances of single exposures G = CᵀC − (CᵀB)(CᵀB)ᵀ, s = CᵀPr
 Symbols     c column of a change without a pattern over the field, c_p its rows of the field point p; F_pf value of the
-            term f there; V any columns of rows; B = [Q, Z] orthonormal basis Q of the derivatives by the free
-            parameters, Z Zᵀ the part that single exposures take up (`examination.common_mode`); P = 1 − BBᵀ;
+            term f there; V any columns of rows; B = [Q, Z], Q an orthonormal basis of the derivatives by the
+            free parameters, Z Zᵀ the part that single exposures take up (`examination.common_mode`); P = 1 − BBᵀ;
             r residuals
 Limits      Ghosts of the model, 10⁻³ of the light, carry the pattern of the field point at which they are seen, and not
             that of the opposite one, from which they come. A fit has them exactly.
@@ -17,7 +17,7 @@ Limits      Ghosts of the model, 10⁻³ of the light, carry the pattern of the 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -36,18 +36,22 @@ from walop_jax.model.effects.factors import SMOOTH_DEGREE, smooth_deviations
 class SmoothFields:
     """The smooth fields that a fit may lack, with their products behind the free parameters.
 
-    `basis` are the columns of B (module docstring), by rows of data and priors.
+    `bases` are Q and Z (module docstring), by rows of data and priors, `synonyms` other names of candidates.
     """
 
     design: Design
     fields: Sequence[SmoothField]
     context: Context
-    basis: AnyMatrix
+    bases: tuple[AnyMatrix, AnyMatrix]
+    synonyms: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     def behind(self, columns: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
         """What neither the free parameters nor the disturbances of single exposures take up of columns, by rows."""
-        basis = self.basis[: len(columns)]
-        return columns - basis @ (basis.T @ columns)
+        rows = [basis[: len(columns)] for basis in self.bases]
+        taken = [basis.T @ columns for basis in rows]
+        return columns - sum(
+            (basis @ along for basis, along in zip(rows, taken, strict=True)), np.zeros_like(columns)
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -84,10 +88,11 @@ class SmoothFields:
     @cached_property
     def grams(self) -> list[AnyMatrix]:
         """The Gram matrix of each candidate, behind the free parameters."""
-        along, grams, stop = self.products(self.basis), list[AnyMatrix](), 0
+        taken, grams, stop = [self.products(basis) for basis in self.bases], list[AnyMatrix](), 0
         for square in self._before:
-            own = along[stop : (stop := stop + len(square))]
-            grams.append(square - own @ own.T)
+            own = [along[stop : stop + len(square)] for along in taken]
+            grams.append(square - sum((along @ along.T for along in own), np.zeros_like(square)))
+            stop += len(square)
         return grams
 
     def products(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "a n"]:
@@ -151,8 +156,8 @@ class SmoothFields:
     def _columns(self) -> Float[np.ndarray, "d c"]:
         """Columns of the distinct changes, without a pattern over the field, in units of the noise."""
         distinct = {change.text: change for field in self.fields for change in field.changes}
-        columns = self.design.columns.of([[(1.0, change)] for change in distinct.values()])
-        return (columns / self.design.fit.noise_scale).astype(np.float32)
+        _, columns = self.design.columns.rounded([[(1.0, change)] for change in distinct.values()], 0)
+        return columns / np.float32(self.design.fit.noise_scale)
 
     @cached_property
     def _terms(self) -> Float[np.ndarray, "p f"]:

@@ -19,7 +19,6 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -89,8 +88,7 @@ class Layout:
             inside = {
                 n: dataclasses.replace(one, columns=one.columns[self.inside]) for n, one in asked.items()
             }
-            known = SimpleNamespace(candidates=inside, is_like=lambda design: True, synonyms={})
-            return examine(result, hypotheses, rng, known)  # type: ignore[arg-type]
+            return examine(result, hypotheses, rng, computed=inside, synonyms_apart=True)
 
         used = (one.intensities.block(0, len(one.points)).used for one in (fitted, whole))
         inside, every = used
