@@ -87,7 +87,7 @@ def test_working_parts_are_not_between_results():
         (result, ("with_verdict", "with_doubt", "with_remark", "checked_verdict", "shown", "of")),
         (calibration, ("shown", "widened", "with_covariance", "matrix_columns")),
         (result.verdict, ("on_top_of", "recorded", "answers")),
-        (result.likelihood, ("data_terms", "with_errors_at", "points_as_stated", "left", "of")),
+        (result.likelihood, ("data_terms", "with_errors_at", "points_as_stated", "taken", "of")),
     ):
         assert [name for name in working if not hasattr(one, name)] == []
         assert set(working) & set(dir(one)) == set()

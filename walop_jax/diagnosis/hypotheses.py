@@ -125,7 +125,7 @@ class SmoothField(NamedTuple):
 class Hypotheses(NamedTuple):
     """All possible omissions of a model: probes of effects with a name, and descriptions.
 
-    `descriptions` are those that no effect holds, `parts` those that are a part of effects. `effects` are those that
+    `descriptions` are those that no effect holds, `parts` those that are part of effects. `effects` are those that
     fit the instrument, `every` all descriptions, those that are an effect by another name as well. `smooth` are changes
     that may vary over the field in any smooth way, which no list of simple patterns holds.
     """

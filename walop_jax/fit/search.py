@@ -107,7 +107,7 @@ def with_errors_fitted(
     for i in at[: len(noise.scales)]:  # scales stand ahead of fractions
         if model.parameters[i].free:
             start[i] *= np.sqrt(expansion.misfit)
-    at_start, values, sought = likelihood, best.x, best
+    at_start, values, sought, found = likelihood, best.x, best, best
     for _ in range(ERROR_ROUNDS):
         taken = _taken_up(at_start, values, expansion)
         live = dataclasses.replace(likelihood.with_errors_at(None), taken=taken)

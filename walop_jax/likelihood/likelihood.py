@@ -200,8 +200,8 @@ class Likelihood(ShortDir):
     """
 
     _working = (
-        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "left", "nodes",
-        "points", "points_as_stated", "runner", "weak", "with_errors_at",
+        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "nodes",
+        "points", "points_as_stated", "runner", "taken", "weak", "with_errors_at",
     )  # fmt: skip
 
     layout: Layout
