@@ -87,12 +87,15 @@ class Points:
         return len(self.x)
 
 
-def made_up(rng):
-    """Smooth fields of three changes beside random columns, parameters and residuals; and the matrices behind them."""
+def made_up(rng, length=1.0):
+    """Smooth fields of three changes beside random columns, parameters and residuals; and the matrices behind them.
+
+    The columns have entries of about `length`.
+    """
     x, y = rng.uniform(-0.3, 0.3, (2, 5))
     point = np.repeat(np.arange(5), (4, 8, 4, 12, 4))
     rows, priors = len(point), 3
-    columns = rng.standard_normal((rows, 3)).astype(np.float32)
+    columns = (length * rng.standard_normal((rows, 3))).astype(np.float32)
     basis = np.linalg.qr(rng.standard_normal((rows + priors, 6)))[0]
     residual = rng.standard_normal(rows + priors)
     design = object.__new__(Design)
@@ -139,7 +142,7 @@ def test_products_of_random_columns_are_those_of_columns_written_out():
 
 def test_a_smooth_field_is_fitted_with_the_most_probable_scale_of_its_prior():
     """Scale and amplitudes against densities of the residuals, and ridge regression, on columns written out."""
-    smooth, written, behind = made_up(np.random.default_rng(5))
+    smooth, written, behind = made_up(np.random.default_rng(5), 2000.0)
     name, count, noise = smooth.names[0], len(legendre.terms(SMOOTH_DEGREE)), 0.7
     item = smooth.ranked(name, noise)
     c, residual, widths = written[:, :count], smooth.design.residual, item.probe.widths
@@ -150,7 +153,7 @@ def test_a_smooth_field_is_fitted_with_the_most_probable_scale_of_its_prior():
         determinant = np.linalg.slogdet(np.eye(count) + np.outer(t * widths, t * widths) * information)[1]
         return 0.5 * pull @ matrix @ pull - 0.5 * determinant
 
-    assert item.scale == max(SCALES, key=log_density)
+    assert item.scale == max(SCALES, key=log_density) < 1.0
     expected = -np.linalg.solve(information + np.diag((item.scale * widths) ** -2.0), pull)
     assert np.allclose(item.score.amplitudes, expected, atol=1e-4 * np.abs(expected).max())
 
