@@ -73,6 +73,7 @@ MADE_OF_N = (
     "{} holds the noise of N: SKY is proportional to N, so it is no level of the sky, and what is left of that in the "
     "counts was not asked; give the level that was subtracted, or leave SKY out"
 )
+DRAWN_TOGETHER = 20  # draws that are projected together: copies of all, in double precision, were 300 MB
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
 UNEVEN = 1.25
@@ -167,7 +168,9 @@ def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = No
     residual = design.projector(design.residual)
     noise = float(np.sqrt(residual @ residual / max(design.projector.free, 1))) or 1.0
     normal = np.random.default_rng(seed).standard_normal((len(residual), DRAWS), dtype=np.float32)
-    normal = design.projector(normal).astype(np.float32)
+    for first in range(0, DRAWS, DRAWN_TOGETHER):
+        at = slice(first, first + DRAWN_TOGETHER)
+        normal[:, at] = design.projector(normal[:, at])
     asked, first, sums = [probe for probe in probes if probe.name not in known], 0, dict[str, _Products]()
     used = design.measured.used
     for number, made in enumerate(candidates_by_points(design.columns, asked, POINTS_TOGETHER)):
