@@ -223,6 +223,12 @@ def test_evidence_beside_a_smooth_field_is_a_ratio_of_densities(examined):
     assert found == pytest.approx(log_density(both) - log_density(given), abs=1e-3)
 
 
+def _square():
+    """Places of a square field of the scale of WALOP."""
+    edges = np.linspace(-0.3, 0.3, 201)
+    return np.stack(np.meshgrid(edges, edges)).reshape(2, -1)
+
+
 PLAN = ObservingPlan(
     grid=7, standard_grid=2, polariser_angles=polariser_turn(10), moon_patches=4, standards=4
 )
@@ -253,6 +259,10 @@ def test_a_field_of_plane_waves_is_told_with_its_place_and_law():
     # The field that is told is the one that was put in, to its own errors; nothing is left of 99 % of it.
     (entry,) = document(found)["steps"][0]["sentences"]
     assert "in a smooth field" in step.in_words
+    ((name, shown),) = step.shown.items()
+    assert name == entry["sentence"]
+    expected = 4e-3 * np.sqrt(np.mean(np.cos(waves @ _square()).sum(axis=0) ** 2))
+    assert abs(shown[0] - expected) < 5.0 * shown[1]
     names = list(entry["terms"])
     assert len(names) == len(legendre.terms(SMOOTH_DEGREE))
     at = [found.after.model.index(f"described.{Change.parsed(text).label}") for text in names]

@@ -211,6 +211,16 @@ class Step(FitComparison):
     probability: float = float("nan")
 
     @property
+    def shown(self) -> dict[str, tuple[float, float, str]]:
+        """The parameters for a reader: a smooth field has one row, its rms over the field, and not its terms."""
+        terms = {change.label for change, *_ in self.descriptions if change.candidate != change.text}
+        single = {name: entry for name, entry in self.parameters.items() if name not in terms}
+        smooth = [entry for entry in _said(self.descriptions) if "terms" in entry]
+        return single | {
+            entry["sentence"]: (entry["value"], entry["sigma"], entry["unit"]) for entry in smooth
+        }
+
+    @property
     def in_words(self) -> str:
         """What is missing, where, how large it is and how probable its name.
 
@@ -383,7 +393,7 @@ class Diagnosis(Drawn):
         rows = []
         for step in self.steps:
             entries: dict[str, Any] = {name: (value, 0.0, "") for name, value in step.choices.items()}
-            for name, (value, sigma, unit) in (entries | step.parameters).items():
+            for name, (value, sigma, unit) in (entries | step.shown).items():
                 texts = value_and_error(value, sigma)
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
