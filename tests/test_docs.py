@@ -300,7 +300,11 @@ def numbers_of(tree: ast.Module) -> Iterator[tuple[str, Any]]:
             pairs = list(zip(target.elts, value.elts, strict=True))
         for name, number in pairs:
             leaves = [leaf.value for leaf in ast.walk(number) if isinstance(leaf, ast.Constant)]
-            plain = not any(isinstance(part, ast.Subscript | ast.Dict | ast.Set) for part in ast.walk(number))
+            plain = not any(
+                isinstance(part, ast.Subscript | ast.Dict | ast.Set)
+                or (isinstance(part, ast.Name) and part.id.isupper())  # it follows from another number
+                for part in ast.walk(number)
+            )
             if leaves and plain and all(isinstance(leaf, int | float) for leaf in leaves):
                 yield ast.unparse(name), number
 

@@ -101,7 +101,7 @@ RULES = (
     Rule("priors of additions that the data refute are widened",
          ((refits, "with_refuted_priors_widened"),), lambda _: lambda model, values, name: model,
          lambda args, answer: answer is not args[0]),
-    Rule("additions that the final model does not need go (`LEAST_EVIDENCE`)",
+    Rule("additions that the final model does not need go (`_needed`)",
          ((remainder, "_needed"),), lambda _: lambda result, steps, judge: (result, steps),
          lambda args, answer: answer[0] is not args[0]),
     Rule("names that leave a poor fit poor are parts (`PART`)", ((remainder, "_parts"),), always({}), answers),

@@ -75,11 +75,11 @@ def prune(first: State, state: State, judge: Refits) -> State:
 def _needed(
     result: FitResult, steps: tuple[Trial, ...], judge: Refits
 ) -> tuple[FitResult, tuple[Trial, ...]]:
-    """A fit without the additions that are worth less than `thresholds.LEAST_EVIDENCE`, and the additions that stay."""
+    """A fit without the additions that the model is more probable without, and the additions that stay."""
     while steps and len(result.model.template.effects) > 1:
         worth = {step.effect.name: evidence_of_presence(result, step.effect.name) for step in steps}
         least = min(worth, key=lambda name: worth[name])
-        if worth[least] >= thresholds.LEAST_EVIDENCE:
+        if worth[least] >= 0.0:  # ln B of its presence
             break
         judge.tell(f"{least} is no longer needed")
         steps = tuple(step for step in steps if step.effect.name != least)
@@ -220,7 +220,7 @@ def _worse(first: Examination, state: State) -> str:
     schemes = [step.compared.heldout_scheme for step in state.steps]
     scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
     before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
-    if after > (1.0 + thresholds.HELD_OUT_WORSE) * before:
+    if after > before:
         return f"{scheme} that are left out (mean squared residual {before:.3g} → {after:.3g})"
     return ""
 

@@ -6,9 +6,15 @@ needs its line in the table of the ablation (`tests/studies/ablation.py`), on sc
 
 from __future__ import annotations
 
+import math
+
 # Is anything missing?
 
-ALARM = 0.0027  # global p below which something is missing, and corrected p below which a candidate is significant: 3 σ
+SEPARATION = (
+    3.0  # standard errors: the distance below which data cannot distinguish two candidates, and of an alarm
+)
+# Global p below which something is missing, and corrected p below which a candidate is significant: 0.0027, of 3 σ.
+ALARM = math.erfc(SEPARATION / math.sqrt(2.0))
 COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera in one exposure may have
 
 # What is missing, and which candidate it is (`selection`)?
@@ -33,18 +39,13 @@ FLOOR = 1.25  # σ of the residuals behind all candidates above which evidence c
 # by which another reading of the data must, to be reported.
 PART = 10.0
 HOPEFUL = 1.0  # standard errors by which the linear step of a description must predict unseen settings better
-# Difference in evidence that is no preference. More loss in ln p of the exposures of one KIND, as those of others
-# predict them, and in −χ²/2 of that, contradicts an addition.
-EVEN_ODDS = 3.0
+# Difference in evidence below which the better of two is not certain: odds of 19 to 1. More loss in ln p of the
+# exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
+EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
 # Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
 # class are averaged.
 IMPROBABLE = 6.9
-# Below it the data cannot distinguish two candidates. No plausible member of a class may lie farther from an element
-# of a trusted product, in its errors.
-SEPARATION = 3.0
-LEAST_EVIDENCE = 1.0  # evidence that an effect must be worth to the final model to stay in it
 USEFUL = 2.0  # standard errors by which a term without a name must predict unseen settings better to be kept
-HELD_OUT_WORSE = 0.01  # share by which a diagnosis may predict exposures worse that were left out
 MOST_WIDTHS = 10.0  # prior widths beyond which an amplitude of an optical description explains nothing
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
 MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
