@@ -107,18 +107,18 @@ def with_errors_fitted(
     for i in at[: len(noise.scales)]:  # scales stand ahead of fractions
         if model.parameters[i].free:
             start[i] *= np.sqrt(expansion.misfit)
-    at_start, values, sought, found = likelihood, best.x, best, best
+    at_start, values, found = likelihood, best.x, best
     for _ in range(ERROR_ROUNDS):
         taken = _taken_up(at_start, values, expansion)
         live = dataclasses.replace(likelihood.with_errors_at(None), taken=taken)
         label = "fit with errors of the data"
-        found = _search(live, label, model.full(start[model.free], start), noise_scale, expansion)
-        found = dataclasses.replace(found, starts=best.starts, steps=sought.steps + found.steps)
+        sought = _search(live, label, model.full(start[model.free], start), noise_scale, expansion)
+        found = dataclasses.replace(sought, starts=best.starts, steps=found.steps + sought.steps)
         moved = (found.x - start)[model.free] * np.sqrt(np.diag(found.expansion.matrix))
         if not found.converged or np.abs(moved[np.isin(model.free, at)]).max(initial=0.0) < SETTLED:
             break
         # What the other parameters take up of the data hangs on the errors, a little.
-        start, sought, values = found.x.copy(), found, found.x
+        start, values = found.x.copy(), found.x
         at_start = likelihood.with_errors_at(values)
         expansion = at_start.expand(values, noise_scale, expansion)
     return found
