@@ -164,9 +164,8 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
 def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> tuple[SmoothField, ...]:
     """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with."""
     found: dict[str, SmoothField] = {}
-    for bases, patterns, group, order in _with_laws(
-        dataclasses.replace(instrument, effects=()), exposures, points
-    ):
+    bare = dataclasses.replace(instrument, effects=())
+    for bases, patterns, group, order in _with_laws(bare, exposures, points, every_kind=True):
         if not any(PATTERNS[pattern] != ("",) for pattern in patterns if pattern != "rings"):
             continue
         for base in bases:
@@ -179,7 +178,7 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
 
 
 def _with_laws(
-    instrument: Instrument, exposures: Exposures, points: int
+    instrument: Instrument, exposures: Exposures, points: int, *, every_kind: bool = False
 ) -> Iterator[tuple[list[Base], list[str], tuple[str, ...], int]]:
     """Changes that are tried together, the patterns over the field of each, a law of the exposures for each.
 
@@ -187,7 +186,8 @@ def _with_laws(
     """
     over_field, everything = points >= FEWEST_POINTS, np.ones(len(exposures), bool)
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
-        shown = Dependences(exposures, over_field, prefixes, everything if inside is None else inside)
+        seen = everything if inside is None else inside
+        shown = Dependences(exposures, over_field, prefixes, seen, every_kind)
         first = bases["alone"][0][0]
         order = (
             -1 if first.relation in ("behind", "ahead of") else 1
@@ -338,13 +338,15 @@ class Dependences:
     """Factors that exposures can tell apart: groups by form (`Combinations.along`), each factor with an amplitude.
 
     `over_field` is True with enough points for a pattern; factors may depend on the angles of the elements
-    `prefixes`, and are limited to the exposures `inside`.
+    `prefixes`, and are limited to the exposures `inside`. With `every_kind` the most frequent KIND is a factor as well:
+    parameters of the model hold what is the same in all KINDs, but not every pattern over the field.
     """
 
     exposures: Exposures
     over_field: bool
     prefixes: tuple[str, ...]
     inside: Bool[np.ndarray, " e"]
+    every_kind: bool = False
 
     def of(self, form: str) -> Iterator[tuple[str, ...]]:
         """The groups of one form."""
@@ -431,7 +433,7 @@ class Dependences:
     def _kind(self) -> Iterator[tuple[str, ...]]:
         """Kinds of exposures; of all exposures without the most frequent, beside which parameters hold the same."""
         names, counts = np.unique(self.exposures.kind[self.inside], return_counts=True)
-        first = int(self.inside.all() or len(names) == 1)
+        first = int(len(names) == 1 or (bool(self.inside.all()) and not self.every_kind))
         yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][first:])
 
     def _exposure(self) -> Iterator[tuple[str, ...]]:
