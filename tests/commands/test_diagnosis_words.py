@@ -58,6 +58,8 @@ def test_the_first_line_says_what_is_missing_where_and_how_large(found: Diagnosi
         "a dark spot in front of one camera, O2: depth 0.00600 ± 0.00050, x 0.110 ± 0.010 deg (blemish, probability "
         "0.97)"
     )
+    shown = dataclasses.replace(found, steps=(dataclasses.replace(spot, choices={"camera": 2}),)).display()
+    assert ["blemish", "camera", "O2"] == list(shown.rows[0][:3])
     turned = dataclasses.replace(
         spot,
         effect="clp_zero",
