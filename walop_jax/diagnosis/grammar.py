@@ -40,6 +40,7 @@ from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.cameras import POWERS
 from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY, Change
 from walop_jax.model.effects.etalon import probed_gaps
+from walop_jax.model.effects.factors import FIELD
 from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.effects.numbers import OF_QU
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, GROUPS
@@ -153,7 +154,7 @@ def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Bas
 
 def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[Base]:
     """All groups of descriptions: the changes of each subject, with each pattern over the field and each law."""
-    for bases, patterns, group, order in _with_laws(instrument, exposures, points):
+    for bases, patterns, _, group, order in _with_laws(instrument, exposures, points):
         for pattern, base in itertools.product(patterns, bases):
             pairs = [
                 tuple(filter(None, pair[::order])) for pair in itertools.product(group, PATTERNS[pattern])
@@ -162,11 +163,17 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
 
 
 def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> tuple[SmoothField, ...]:
-    """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with."""
+    """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with.
+
+    Changes that begin or end at some time are tried without a pattern, but for smooth fields.
+    """
     found: dict[str, SmoothField] = {}
     bare = dataclasses.replace(instrument, effects=())
-    for bases, patterns, group, order in _with_laws(bare, exposures, points, every_kind=True):
-        if not any(PATTERNS[pattern] != ("",) for pattern in patterns if pattern != "rings"):
+    over_field = points >= FEWEST_POINTS
+    for bases, patterns, form, group, order in _with_laws(bare, exposures, points, every_kind=True):
+        allowed = KINDS[bases[0][0].kind].grows(bare, bases[0][0]).allowed if bases else ()
+        sudden = over_field and form in SUDDEN and FIELD in allowed
+        if not sudden and all(PATTERNS[pattern] == ("",) for pattern in patterns if pattern != "rings"):
             continue
         for base in bases:
             changes = [description.times(*filter(None, (law,))) for description in base for law in group]
@@ -179,10 +186,11 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
 
 def _with_laws(
     instrument: Instrument, exposures: Exposures, points: int, *, every_kind: bool = False
-) -> Iterator[tuple[list[Base], list[str], tuple[str, ...], int]]:
+) -> Iterator[tuple[list[Base], list[str], str, tuple[str, ...], int]]:
     """Changes that are tried together, the patterns over the field of each, a law of the exposures for each.
 
-    The last number is −1 where a pattern stands ahead of the law in a text, 1 where it stands behind it.
+    Of the law its form and its factors. The last number is −1 where a pattern stands ahead of the law in a text, 1
+    where it stands behind it.
     """
     over_field, everything = points >= FEWEST_POINTS, np.ones(len(exposures), bool)
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
@@ -195,8 +203,9 @@ def _with_laws(
         for over, along, among in KINDS[first.kind].grows(instrument, first).tried:
             patterns = [name for name in over if over_field or name == "even"]
             alternatives = list(itertools.chain(*(bases.get(name, ()) for name in among)))
-            for group in itertools.chain(*map(shown.of, along)):
-                yield alternatives, patterns, group, order
+            for form in along:
+                for group in shown.of(form):
+                    yield alternatives, patterns, form, group, order
 
 
 def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:
@@ -294,6 +303,7 @@ def _of_cameras(
             yield Subject.of(_base(("light",), "in", name, origin))
 
 
+SUDDEN = ("step", "side", "night")  # laws of changes that begin or end at some time
 STEPS, FEW = 16, 18  # times of a step in the first search; most times for which all spells are tried
 AFTER = 0.5  # hours behind the last exposure that a step ends
 NEARLY_TIME = 0.999  # correlation of the order of exposures with time
