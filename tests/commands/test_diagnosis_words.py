@@ -59,7 +59,7 @@ def test_the_first_line_says_what_is_missing_where_and_how_large(found: Diagnosi
         "0.97)"
     )
     shown = dataclasses.replace(found, steps=(dataclasses.replace(spot, choices={"camera": 2}),)).display()
-    assert ["blemish", "camera", "O2"] == list(shown.rows[0][:3])
+    assert list(shown.rows[0][:3]) == ["blemish", "camera", "O2"]
     turned = dataclasses.replace(
         spot,
         effect="clp_zero",

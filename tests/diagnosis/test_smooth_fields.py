@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import builders
 import numpy as np
 import pytest
 from small_run import SMALL
@@ -11,8 +12,8 @@ from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
-from walop_jax.diagnosis.grammar import hypotheses
-from walop_jax.diagnosis.hypotheses import Hypotheses, SmoothField
+from walop_jax.diagnosis.grammar import hypotheses, smooth_fields
+from walop_jax.diagnosis.hypotheses import Hypotheses, SmoothField, texts_of
 from walop_jax.diagnosis.score import SCALES
 from walop_jax.diagnosis.selection import JointScores
 from walop_jax.diagnosis.smooth_fields import SmoothFields
@@ -26,6 +27,7 @@ from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change
 from walop_jax.model.effects.factors import SMOOTH_DEGREE, SMOOTH_LENGTH, smooth_deviations
 from walop_jax.model.effects.in_models import known_effects
+from walop_jax.model.instrument import nominal_instrument
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
 
@@ -75,6 +77,33 @@ def examined():
     listed = hypotheses(known_effects(model), model.template, calset.exposures, len(calset.points))
     few = Hypotheses(listed.names[:4], listed.descriptions[:60], (), listed.effects, (), listed.smooth)
     return examine(result, few, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB"])
+def test_every_smooth_field_can_be_said_of_its_instrument(name):
+    """Its terms are allowed where it is, and its laws are those of the exposures: each KIND, and steps in time."""
+    instrument = nominal_instrument(name)
+    kinds = ("clp", "clp", "clp", "clp", "moon", "moon", "standard", "standard", "clp", "clp")
+    exposures = builders.exposures(
+        *(
+            {"kind": kind, "mjd": 61000.0 + hour / 24.0, "clp_in": kind == "clp", "clp_angle": 36.0 * hour}
+            for hour, kind in enumerate(kinds)
+        )
+    )
+    fields = smooth_fields(instrument, exposures, 25)
+    assert len({field.name for field in fields}) == len(fields)
+    context = Context()
+    for field in fields:
+        probe = field.probe(context)
+        assert len(probe.widths) == len(field.changes) * len(legendre.terms(SMOOTH_DEGREE))
+        for text in texts_of(probe)[:: len(legendre.terms(SMOOTH_DEGREE)) - 1]:
+            Change.parsed(text).check_factors(instrument)
+            assert Change.parsed(text).candidate in field.name
+    camera = instrument.cameras.names[0]
+    laws = {change.beside_field for field in fields for change in field.changes if change.place == camera}
+    assert {("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= laws
+    assert any(len(law) == 1 and law[0].startswith("hours 4.5 to ") for law in laws)
+    assert not smooth_fields(instrument, exposures, 4)  # too few points for a pattern
 
 
 class Points:
