@@ -60,6 +60,16 @@ def test_the_first_line_says_what_is_missing_where_and_how_large(found: Diagnosi
     )
     shown = dataclasses.replace(found, steps=(dataclasses.replace(spot, choices={"camera": 2}),)).display()
     assert list(shown.rows[0][:3]) == ["blemish", "camera", "O2"]
+    # √((0.001 s₀²)² + (0.004 s₁ s₀/√3)²) of s₀ = 0.7083 and s₁ = 0.9212; errors by hand in the same way.
+    terms = tuple(
+        (Change.parsed(f"gain of O1 * hours * field {i} 0"), size, 0.0002)
+        for i, size in enumerate((0.001, 0.004))
+    )
+    smooth = dataclasses.replace(spot, effect="described", descriptions=terms, parameters={})
+    words = (
+        "gain of O1: 0.001588 ± 0.000078 rms, in a smooth field, growing with time (per hour since the first"
+    )
+    assert smooth.in_words.startswith(words)
     turned = dataclasses.replace(
         spot,
         effect="clp_zero",

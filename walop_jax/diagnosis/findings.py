@@ -489,9 +489,9 @@ def _smooth(name: str, terms: Sequence[tuple[Change, float, float]]) -> dict[str
     first = terms[0][0]
     law = dataclasses.replace(first, factors=first.beside_field)
     entry = _described(law, value, sigma)
-    dependence = ["in a smooth field (rms over the field)", *entry["dependence"]]
-    kind = entry["words"].partition(": ")[0]
-    words = f"{kind}, {', '.join(dependence)}: {entry['words'].partition(': ')[2].partition(',')[0]}"
+    dependence = ["in a smooth field", *entry["dependence"]]
+    kind, size = entry["words"].split(", ")[0].split(": ")
+    words = f"{kind}: {size} rms, {', '.join(dependence)}"
     further = {change.text: {"value": size, "sigma": error} for change, size, error in terms}
     return entry | {
         "sentence": name, "dependence": dependence, "words": words, "tested_by": first.tested_by, "terms": further,
