@@ -396,7 +396,7 @@ class Diagnosis(Drawn):
             for name, (value, sigma, unit) in (entries | step.shown).items():
                 texts = value_and_error(value, sigma)
                 if name == "camera" and name in step.choices:
-                    texts = (str(self.after.model.template.cameras.names[value]), "")
+                    texts = (str(self.after.model.template.cameras.names[int(value)]), "")
                 rows.append((step.effect, name, *texts, unit, probability(step.p_value).removeprefix("= ")))
         before, after = (fit.chi2 / max(fit.dof, 1) for fit in (self.before, self.after))
         found = [step.in_words for step in self.steps]
