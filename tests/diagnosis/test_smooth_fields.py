@@ -310,3 +310,27 @@ def test_a_field_of_plane_waves_is_told_with_its_place_and_law():
     off = told - 4e-3 * field
     assert np.mean((off / error) ** 2) < 2.0
     assert np.mean(off**2) < 0.02 * np.mean((4e-3 * field) ** 2)
+
+
+def test_a_field_of_one_kind_may_as_well_begin_when_others_do():
+    """The polariser comes first: a gain in its exposures alone, and its opposite from then on, are one class."""
+    calset, truth = simulate(PLAN, seed=8)
+    e = calset.exposures
+    calset = dataclasses.replace(
+        calset, exposures=dataclasses.replace(e, temp=10.0 + np.cos(2.0 * np.arange(len(e))))
+    )
+    waves = np.random.default_rng(9).normal(0.0, 5.0, (3, 2))
+    block = calset.intensities.block(0, len(calset.points))
+    field = np.cos(waves @ np.stack([calset.points.x, calset.points.y])).sum(axis=0)
+    counts = np.array(block.counts)
+    counts[..., 1] *= 1.0 + 4e-3 * field[:, None] * (e.kind == "clp")
+    changed = dataclasses.replace(block, counts=counts)
+    found = diagnose(dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, changed)))
+    (addition,) = found.members.additions
+    names = {addition.added, *addition.names}
+    camera = truth.cameras.names[1]
+    assert f"gain of {camera} * kind clp * smooth" in names
+    assert any(name.startswith(f"gain of {camera} * hours ") for name in names)
+    # Stars are seen through the one or the other: the error between the two dominates.
+    assert addition.spread > 3.0 * addition.stated
+    assert not found.after.trusted

@@ -82,7 +82,7 @@ class Scenes:
         points, design = self.examined.result.calset.points, self.examined.design
         at = np.stack([points.x, points.y]) / self.examined.result.model.template.units.field
         for _ in range(waves):
-            field = self.smooth.fields[rng.integers(len(self.smooth.fields))]
+            field = self.smooth.fields[int(rng.integers(len(self.smooth.fields)))]
             vectors, phases = rng.normal(0.0, STEEPEST, (WAVES, 2)), rng.uniform(0, 2 * np.pi, WAVES)
             pattern = np.cos(vectors @ at + phases[:, None]).sum(axis=0)
             changes = [((1.0, change),) for change in field.changes]

@@ -34,7 +34,7 @@ from walop_jax.diagnosis.class_product import ClassMember, ClassOf, WeightedChan
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import texts_of
-from walop_jax.diagnosis.score import FAINTEST, log_bayes
+from walop_jax.diagnosis.score import FAINTEST, SCALES, log_bayes
 from walop_jax.diagnosis.synonyms import ALIKE
 from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.fit.refit import PRIOR_EDGE
@@ -74,7 +74,8 @@ def classes_of(
                 change = -design.jacobian[: design.rows, at] @ fit.values[model.free[at]]
                 sums = tuple(((1.0, description),) for description in descriptions)
                 whole = frozenset((*name.split("; "), *group))
-                classes.append(laid.class_of("; ".join(group), at, change, sums, added.get(name, ()), whole))
+                called = "; ".join(dict.fromkeys(item.candidate for item in descriptions))
+                classes.append(laid.class_of(called, at, change, sums, added.get(name, ()), whole))
     return tuple(group for group in classes if group.names)
 
 
@@ -152,6 +153,7 @@ class LinearisedFit:
         step = LinearStep(self, at, lost)
         addition, widths = step.addition(name, sums)
         best, rivals = step.candidates(addition, alike, whole)
+        rivals += step.smooth_fields(addition, best, whole)
         # Exact fits chose the addition: where it is less probable by one linear step, the step is inaccurate.
         by_step, members = [addition, *(member for member, _ in rivals)], [addition._replace(evidence=best)]
         for member, is_alike in rivals:
@@ -282,6 +284,43 @@ class LinearStep:
             column = design.stacked([state.candidates[probe.name].columns])
             members.append((self.member(probe.name, sums, column, probe.widths, evidence), close))
         return best, members
+
+    def smooth_fields(
+        self, addition: ClassMember, best: float, whole: frozenset[str]
+    ) -> list[tuple[ClassMember, bool]]:
+        """Members of the class of a smooth field: others that would not be improbable in its place.
+
+        They are listed as `candidates` lists others. Beside the model without the addition the Gram matrix of a field
+        is that beside the model with it, and the part of its columns along those of the addition.
+        """
+        smooth, design, texts = self.laid.state.smooth, self.laid.design, _texts(addition.sums)
+        names = {Change.parsed(text).candidate for text in (*texts, *whole) if " * field " in text}
+        if smooth is None or not names:
+            return []
+        along, scores = smooth.products(self.basis), smooth.products(self.left[:, None])[:, 0]
+        evidence, stop = dict[str, float](), 0
+        for name, gram in zip(smooth.names, smooth.grams, strict=True):
+            at = slice(stop, stop := stop + len(gram))
+            square = gram + along[at] @ along[at].T
+            evidence[name] = (
+                log_bayes(square, scores[at], smooth.widths_of(name)) / self.laid.state.scatter**2
+            )
+        own = max((value for name, value in evidence.items() if names == set(name.split("; "))), default=best)
+        near = {name: value for name, value in evidence.items() if value > own - thresholds.IMPROBABLE}
+        members = list[tuple[ClassMember, bool]]()
+        for name in sorted(near, key=near.__getitem__, reverse=True)[: thresholds.MOST_CLASSES]:
+            (member,) = smooth.probe(name).group
+            sums = tuple(map(tuple, member.first_order(self.laid.template)))
+            if names == set(name.split("; ")) or not self._can_be_said(sums):
+                continue
+            column = design.stacked([smooth.candidate(name).columns])
+            projected = self.projector(column)
+            square, pull = projected.T @ projected, projected.T @ self.left
+            widths = smooth.widths_of(name)
+            scale = max(SCALES, key=lambda t: log_bayes(square, pull, widths, np.array([t])))
+            relative = best + near[name] - own
+            members.append((self.member(name, sums, column, scale * widths, relative), True))
+        return members
 
     def in_other_kinds(self, member: ClassMember, widths: AnyVector | None = None) -> ClassMember | None:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.

@@ -80,6 +80,11 @@ class SmoothFields:
         shown = (after > ABSORBED * before) & (np.sqrt(np.clip(after, 0.0, None)) * widths > FAINTEST)
         return np.where(shown, widths, 0.0)
 
+    def widths_of(self, name: str) -> AnyVector:
+        """Prior widths of the amplitudes of one candidate, whatever the data can show."""
+        changes, count = self.fields[self._number[name]].changes, self._terms.shape[1]
+        return np.repeat([change.width(self.context.largest) for change in changes], count)
+
     @cached_property
     def scores(self) -> AnyVector:
         """CᵀPr of all amplitudes."""
