@@ -293,9 +293,10 @@ class LinearStep:
         They are listed as `candidates` lists others. Beside the model without the addition the Gram matrix of a field
         is that beside the model with it, and the part of its columns along those of the addition.
         """
-        smooth, design, texts = self.laid.state.smooth, self.laid.design, _texts(addition.sums)
-        names = {Change.parsed(text).candidate for text in (*texts, *whole) if " * field " in text}
-        if smooth is None or not names:
+        texts = (*_texts(addition.sums), *whole)
+        names = {Change.parsed(text).candidate for text in texts if " * field " in text}
+        smooth, design = self.laid.state.smooth if names else None, self.laid.design
+        if smooth is None:
             return []
         along, scores = smooth.products(self.basis), smooth.products(self.left[:, None])[:, 0]
         evidence, stop = dict[str, float](), 0
