@@ -34,7 +34,7 @@ from walop_jax.diagnosis.class_product import ClassMember, ClassOf, WeightedChan
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import texts_of
-from walop_jax.diagnosis.score import FAINTEST, SCALES, log_bayes
+from walop_jax.diagnosis.score import FAINTEST, best_scale, log_bayes
 from walop_jax.diagnosis.synonyms import ALIKE
 from walop_jax.diagnosis.undetected_errors import usual_exposure
 from walop_jax.fit.refit import PRIOR_EDGE
@@ -299,13 +299,10 @@ class LinearStep:
         if smooth is None:
             return []
         along, scores = smooth.products(self.basis), smooth.products(self.left[:, None])[:, 0]
-        evidence, stop = dict[str, float](), 0
-        for name, gram in zip(smooth.names, smooth.grams, strict=True):
-            at = slice(stop, stop := stop + len(gram))
-            square = gram + along[at] @ along[at].T
-            evidence[name] = (
-                log_bayes(square, scores[at], smooth.widths_of(name)) / self.laid.state.scatter**2
-            )
+        laid = dict[str, tuple[AnyMatrix, AnyVector, AnyVector]]()  # Gram matrix, scores, prior widths
+        for (name, at), gram in zip(smooth.places.items(), smooth.grams, strict=True):
+            laid[name] = gram + along[at] @ along[at].T, scores[at], smooth.widths_of(name)
+        evidence = {name: log_bayes(*of) / self.laid.state.scatter**2 for name, of in laid.items()}
         own = max((value for name, value in evidence.items() if names == set(name.split("; "))), default=best)
         near = {name: value for name, value in evidence.items() if value > own - thresholds.IMPROBABLE}
         members = list[tuple[ClassMember, bool]]()
@@ -315,12 +312,8 @@ class LinearStep:
             if names == set(name.split("; ")) or not self._can_be_said(sums):
                 continue
             column = design.stacked([smooth.candidate(name).columns])
-            projected = self.projector(column)
-            square, pull = projected.T @ projected, projected.T @ self.left
-            widths = smooth.widths_of(name)
-            scale = max(SCALES, key=lambda t: log_bayes(square, pull, widths, np.array([t])))
-            relative = best + near[name] - own
-            members.append((self.member(name, sums, column, scale * widths, relative), True))
+            widths = best_scale(*laid[name]) * smooth.widths_of(name)
+            members.append((self.member(name, sums, column, widths, best + near[name] - own), True))
         return members
 
     def in_other_kinds(self, member: ClassMember, widths: AnyVector | None = None) -> ClassMember | None:

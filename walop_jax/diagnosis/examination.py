@@ -30,7 +30,6 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.inverses import whitening
 from walop_jax.model.effects import Described, EffectKind
 from walop_jax.model.effects.in_models import effect_context
 from walop_jax.model.instrument import Instrument
@@ -319,11 +318,9 @@ class Examination(Evidence):
         """Columns Z of which Z Zᵀ is what the disturbances of single exposures take up, behind the free parameters."""
         if SINGLE_EXPOSURES not in self.candidates:
             return np.zeros((len(self.design.residual), 0))
-        at, alive = self.bare.places()[SINGLE_EXPOSURES], self.bare.alive
-        place = np.arange(at.start, at.stop)[alive[at]]
-        widths = common_mode(self.bare, self.design)[alive[at]]
-        w = whitening(self.bare.gram[np.ix_(place, place)] + np.diag(widths**-2))
-        columns = self.design.stacked([self.candidates[SINGLE_EXPOSURES].columns[:, alive[at]]])
+        first = self.bare.places()[SINGLE_EXPOSURES].start
+        place, w = self.bare.joining([SINGLE_EXPOSURES], common_mode(self.bare, self.design))
+        columns = self.design.stacked([self.candidates[SINGLE_EXPOSURES].columns[:, place - first]])
         return self.design.projector(columns) @ w
 
     def candidate(self, name: str) -> Candidate:

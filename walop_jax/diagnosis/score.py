@@ -257,6 +257,18 @@ class ScoreSpace:
         alive = self.alive[at]
         return np.where(np.outer(alive, alive), self.gram[at, at], 0.0)
 
+    def joining(
+        self, names: Sequence[str], widths: AnyVector | None = None
+    ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k r"]]:
+        """Amplitudes of some candidates that join the base, and W: their columns times W have WᵀCᵀCW = 1.
+
+        With `widths`, one for each of their amplitudes, a ridge of their inverse squares is added to CᵀC.
+        """
+        place, alive = self.chosen(names), self.alive
+        inverse = np.zeros(len(place)) if widths is None else np.asarray(widths, float) ** -2
+        place, inverse = place[alive[place]], inverse[alive[place]]
+        return place, whitening(self.gram[np.ix_(place, place)] + np.diag(inverse))
+
     def with_base(
         self, names: Sequence[str], widths: AnyVector | None = None
     ) -> tuple[ScoreSpace, Reduction]:
@@ -264,10 +276,7 @@ class ScoreSpace:
 
         With `widths`, one for each of their amplitudes, these are nuisances that are known that well beforehand.
         """
-        place, alive = self.chosen(names), self.alive
-        inverse = np.zeros(len(place)) if widths is None else np.asarray(widths, float) ** -2
-        place, inverse = place[alive[place]], inverse[alive[place]]
-        w = whitening(self.gram[np.ix_(place, place)] + np.diag(inverse))
+        place, w = self.joining(names, widths)
         along = self.gram[:, place] @ w
 
         def reduce(scores: AnyVector, square: float) -> tuple[AnyVector, float]:
@@ -565,6 +574,11 @@ def log_bayes(gram: AnyMatrix, scores: AnyVector, widths: AnyVector, scales: Any
     scales = scales if len(widths) > 1 else np.ones(1)
     log_factors = log_bayes_by_scale(value, vector.T @ (scores * widths), scales)
     return float(np.logaddexp.reduce(log_factors) - np.log(len(log_factors)))
+
+
+def best_scale(gram: AnyMatrix, scores: AnyVector, widths: AnyVector) -> float:
+    """The scale of the prior widths, of `SCALES`, with which a linear effect is most probable."""
+    return float(max(SCALES, key=lambda t: log_bayes(gram, scores, widths, np.array([t]))))
 
 
 def log_bayes_by_scale(

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, Ranked, SmoothField
-from walop_jax.diagnosis.score import ABSORBED, FAINTEST, SCALES, Candidate, ScoreSpace, ScoreTable, log_bayes
+from walop_jax.diagnosis.score import ABSORBED, FAINTEST, Candidate, ScoreSpace, ScoreTable, best_scale
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.model import legendre
 from walop_jax.model.effects import Context
@@ -68,12 +68,15 @@ class SmoothFields:
         return tuple(len(field.changes) * self._terms.shape[1] for field in self.fields)
 
     @cached_property
+    def places(self) -> dict[str, slice]:
+        """Slices of the amplitudes, by candidate."""
+        stops = np.cumsum(self.sizes).tolist()
+        return {n: slice(b - k, b) for n, k, b in zip(self.names, self.sizes, stops, strict=True)}
+
+    @cached_property
     def widths(self) -> AnyVector:
         """Prior widths of all amplitudes, one candidate after the other; those that data cannot show have 0."""
-        count, largest = self._terms.shape[1], self.context.largest
-        widths = np.concatenate(
-            [np.repeat([c.width(largest) for c in f.changes], count) for f in self.fields]
-        )
+        widths = np.concatenate([self.widths_of(name) for name in self.names])
         before, after = (
             np.concatenate([np.diag(square) for square in squares]) for squares in (self._before, self.grams)
         )
@@ -93,12 +96,11 @@ class SmoothFields:
     @cached_property
     def grams(self) -> list[AnyMatrix]:
         """The Gram matrix of each candidate, behind the free parameters."""
-        taken, grams, stop = [self.products(basis) for basis in self.bases], list[AnyMatrix](), 0
-        for square in self._before:
-            own = [along[stop : stop + len(square)] for along in taken]
-            grams.append(square - sum((along @ along.T for along in own), np.zeros_like(square)))
-            stop += len(square)
-        return grams
+        taken = [self.products(basis) for basis in self.bases]
+        return [
+            square - sum((along[at] @ along[at].T for along in taken), np.zeros_like(square))
+            for square, at in zip(self._before, self.places.values(), strict=True)
+        ]
 
     def products(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "a n"]:
         """CᵀV of all amplitudes with any columns V, of which only the rows of data count."""
@@ -133,16 +135,15 @@ class SmoothFields:
         fitted with the most probable of the `SCALES` of the prior.
         """
         number = self._number[name]
-        stop = int(np.sum(self.sizes[: number + 1]))
-        scores, gram = self.scores[stop - self.sizes[number] : stop], self.grams[number]
+        scores, gram = self.scores[self.places[name]], self.grams[number]
         probe, free, before = self.probe(name), self.design.projector.free, np.diag(self._before[number])
         space = ScoreSpace((name,), (self.sizes[number],), probe.widths, before, gram, free)
         score = space.table_after(ScoreTable((), noise, 1.0, 1.0), scores)[name]
         information, pull = gram / noise**2, scores / noise**2
-        scale = max(SCALES, key=lambda t: log_bayes(information, pull, probe.widths, np.array([t])))
+        scale = best_scale(information, pull, probe.widths)
         covariance = np.linalg.inv(information + np.diag((scale * probe.widths) ** -2.0))
         score = dataclasses.replace(score, amplitudes=-covariance @ pull, covariance=covariance)
-        return Ranked(probe, score, score.log_bayes, scale=float(scale))
+        return Ranked(probe, score, score.log_bayes, scale=scale)
 
     # ------------------------------------------------------------------------------------------------ the columns
 
