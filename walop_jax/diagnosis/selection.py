@@ -19,7 +19,8 @@ Evidence     For a set M of candidates, with A their columns once the free param
 Search       Asked once the scores have raised the alarm: the first thing need only be more probable than nothing. The
              most probable candidate is added until something more is missing with a probability below λ. After
              each addition every member is taken out in turn, and the most probable candidate beside the others takes
-             its place, until nothing changes; a member that is less probable than its absence goes.
+             its place, until nothing changes; a member that is less probable than its absence goes. Searches that begin
+            with a part of the candidates (names; effects alone) find sets that no exchange of one member leads to.
 Who it is    The *set* of a thing, given the other things, is the shortest list of names that holds it with probability
              λ, by either of two priors: the one above, in which one description has a thousandth of the probability of
              a name, since there are thousands of them; and one in which all names and all descriptions are equally
@@ -143,7 +144,9 @@ class JointScores:
             for chosen in [np.flatnonzero(sizes == size)]
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
-        self.is_named = np.array([name in self.probes for name in self.names])
+        effects = {name for name, probe in self.probes.items() if probe.effect is not Described}
+        self._is_named = np.array([name in self.probes for name in self.names])
+        self._is_effect = np.array([name in effects for name in self.names])
         self._products: dict[int, AnyMatrix] = {}
         self._known: dict[frozenset[SetMember], Float[np.ndarray, "n t"]] = {}
 
@@ -225,13 +228,14 @@ class JointScores:
     def posterior(self) -> MissingThings:
         """The most probable set of things.
 
-        Where it has a pattern without a name, a second search begins with names alone, and the more probable set of
-        both counts: a pattern takes in two things at once that no single name does, and no exchange of one member for
-        another leads from there to two names.
+        A candidate with many numbers takes in two things at once, and no exchange of one member for another leads from
+        there to two names. Where the most probable set has a pattern, or a description, further searches therefore
+        begin with effects alone and with names alone; of all sets the most probable counts.
         """
         members = self._grown([])
-        if not all(self.is_named[number] for number, _ in members):
-            members = max(members, self._grown(self._grown([], self.is_named)), key=self._total)
+        for begin in (self._is_named, self._is_effect):
+            if not all(begin[number] for number, _ in members):
+                members = max(members, self._grown(self._grown([], begin)), key=self._total)
         nothing_more = float(special.expit(-(self._best(members)[2] + _odds())))
         things = sorted(self._things(members), key=lambda thing: -thing.log_evidence)
         return MissingThings(tuple(things), nothing_more)
@@ -260,7 +264,7 @@ class JointScores:
 
     def _odds_of_patterns(self, worth: AnyVector) -> float:
         """ln [P(any pattern) / P(any name)]; `worth` is ln B π of every candidate."""
-        return _log_sum(worth[~self.is_named]) - _log_sum(worth[self.is_named])
+        return _log_sum(worth[~self._is_named]) - _log_sum(worth[self._is_named])
 
     def _best(
         self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
