@@ -327,9 +327,12 @@ FORTY: dict[str, dict[str, Case]] = {
         "plate + 45": Case(told(placed("CHWP", lambda a: a + 45.0), NORTH), "CHWP_ANGLE is (45|135)"),
         "Y mirrored": Case(told(field(lambda x, y: (x, -y)), NORTH), "Y runs the other way"),
         "cables of E1 and O2 exchanged": Case(told(order(0, 2, 1, 3), NORTH), "order O1, O2, E1, E2"),
-        "polariser backwards, second half": Case(told(half(placed("CLP", np.negative)), NORTH), BACKWARDS),
+        # At these angles that is an exchange of two exposures, number for number.
+        "polariser backwards, second half": Case(
+            told(half(placed("CLP", np.negative)), NORTH), f"{BACKWARDS}|exposures 13 and 15 were exchanged"
+        ),
         "RA in hours": Case(told(column("ra", lambda a: a / 15.0), NORTH), "RA is in hours"),
-        "west longitude": Case(told(site("longitude", lambda v: -v), NORTH), "SITELONG"),
+        "west longitude": Case(told(site("longitude", lambda v: -v), NORTH), "SITELONG|longitude of the site"),
         "North labelled South": Case(told(other_name, NORTH), "they came from WALOP-NORTH"),
         "polariser backwards; Y mirrored": Case(
             told(both(placed("CLP", np.negative), field(lambda x, y: (x, -y))), NORTH),

@@ -68,7 +68,12 @@ def descriptions(instrument: Instrument, exposures: Exposures, points: int) -> t
 def hypotheses(
     catalogue: Sequence[EffectKind], instrument: Instrument, exposures: Exposures, points: int
 ) -> Hypotheses:
-    """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits."""
+    """The one list of candidates of a diagnosis, of the verdict on a fit, and of detection limits.
+
+    Structural effects of `instrument` (a plate left out, the calibration plate in the beam) are part of it: there is no
+    candidate that acts on an element that they remove.
+    """
+    instrument = instrument.as_put_together()
     context = effect_context(instrument, exposures)
     all_probes = descriptions(instrument, exposures, points)
     effects = applicable(catalogue, context, instrument)

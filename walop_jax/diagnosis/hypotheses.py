@@ -225,7 +225,7 @@ def candidates_by_points(
     columns: Columns, wanted: Sequence[Probe], points: int
 ) -> Iterator[dict[str, Candidate]]:
     """The same, for so many points at a time: whole blocks of `limits.RESPONSES_TOGETHER`."""
-    likelihood, template = columns.likelihood, columns.likelihood.model.template
+    likelihood, template = columns.likelihood, columns.likelihood.model.template.as_put_together()
     effects = showable(likelihood.calset, template, [p for p in wanted if p.effect is not Described])
     shown = [*effects, *(p for p in wanted if p.effect is Described)]
     linear: dict[str, list[SumOfChanges]] = {}

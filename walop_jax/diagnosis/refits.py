@@ -34,6 +34,7 @@ from walop_jax.io.progress import Stage
 from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, Effect
+from walop_jax.model.instrument import Instrument
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +59,19 @@ class Refits:
         return f"{fits} fits" if fits >= self.most else ""
 
     def examined(self, result: FitResult, earlier: Examination | None = None) -> Examination:
-        """A fit, scored; the columns of an `earlier` one serve again where the light has hardly changed."""
-        evidence = examine(result, self.hypotheses, self.rng, earlier)
+        """A fit, scored; the columns of an `earlier` one serve again where the light has hardly changed.
+
+        An instrument that is put together otherwise than that of `earlier` has candidates of its own.
+        """
+        candidates, template = self.hypotheses, result.model.template
+        if any(effect.kind.is_structural() for effect in template.effects):
+            calset = result.calset
+            candidates = grammar.hypotheses(
+                candidates.effects, template, calset.exposures, len(calset.points)
+            )
+            if earlier is not None and _structure(earlier.result.model.template) != _structure(template):
+                earlier = None
+        evidence = examine(result, candidates, self.rng, earlier)
         if evidence.alarm:
             self.tell(Stage(f"p = {evidence.table.p_global:.2g}: something is missing", "naming"))
         return evidence
@@ -278,6 +290,11 @@ def _of_one_fold(design: Design, name: str) -> bool:
     square, fold = design.jacobian[: design.rows, at] ** 2, exposure_folds(design)
     of_folds = np.array([square[fold == k].sum(axis=0) for k in np.unique(fold)])
     return bool(np.any(np.count_nonzero(of_folds > thresholds.ROUNDING * of_folds.max(axis=0), axis=0) == 1))
+
+
+def _structure(instrument: Instrument) -> list[tuple[str, Mapping[str, object]]]:
+    """The structural effects of an instrument, with their choices."""
+    return [(e.name, e.choices()) for e in instrument.effects if e.kind.is_structural()]
 
 
 def predicts_unseen(

@@ -257,7 +257,7 @@ def _and(remainder: Unexplained, text: str) -> Unexplained:
 
 # ------------------------------------------------------------------------------- numbers that a set states, and names
 
-_FITTED, _ROUNDS = 3, 3  # stated numbers that are fitted exactly, and steps of each
+_FITTED, _ROUNDS = 6, 3  # stated numbers that are fitted exactly at most, and steps of each
 
 
 def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterator[str]:
@@ -344,7 +344,9 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     added = after is not before
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
-    for current in conditions.clear[:_FITTED]:
+    clear = conditions.clear
+    alike = [item for item in clear if item.score.statistic > clear[0].score.statistic - ALIKE]
+    for current in alike[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
         for _ in range(_ROUNDS):  # Gauss–Newton steps: a clock wrong by hours is not in the linear range
             size += float(current.score.amplitudes[0])

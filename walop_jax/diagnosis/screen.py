@@ -103,8 +103,11 @@ class Screen:
 
     def _residuals_with(self, item: Alternative) -> RowChanges | None:
         try:
+            arranged = None
             if item.effects and not self.likelihood.model.effect_names:
-                rows = self.rows(*self._arranged(item))
+                arranged = self._arranged(item)
+            if arranged is not None:
+                rows = self.rows(*arranged)
             else:
                 calset, model = applied(item, self.calset, self.likelihood.model)
                 # Parameters of standards follow the catalogue: other values there are other values of these.
@@ -115,16 +118,20 @@ class Screen:
             return None
         return rows if np.isfinite(rows).all() else None
 
-    def _arranged(self, item: Alternative) -> tuple[Likelihood, Vector]:
+    def _arranged(self, item: Alternative) -> tuple[Likelihood, Vector] | None:
         """The likelihood of an instrument that is arranged as a cause says, at the values of the screen.
 
-        Arranged in place, not by an effect: instruments that differ in the angles of their plates share a program.
+        Arranged in place, not by an effect: instruments that differ in the angles of their plates share a program. None
+        where the cause takes out an element, and its parameters with it.
         """
         instrument = self.likelihood.model.instrument(self.values)
         for effect in item.effects:
             instrument = effect.patch(instrument)
+        values = np.asarray(values_of(instrument))
+        if len(values) != len(self.values):
+            return None
         model = dataclasses.replace(self.likelihood.model, template=instrument)
-        return Likelihood.of(item.change(self.calset), model), np.asarray(values_of(instrument))
+        return Likelihood.of(item.change(self.calset), model), values
 
     def best(self, items: Iterable[Alternative], most: int = BEST, share: float = 1.0) -> list[Alternative]:
         """The `most` causes that leave less than a `share` of what nothing changed does, and least, in their order."""

@@ -44,7 +44,7 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.laws import YEAR
 
-ALIKE = 25.0  # in χ², within which conditions are reported together
+ALIKE = 2.0 * thresholds.IMPROBABLE  # in χ², within which conditions are reported together
 _PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"

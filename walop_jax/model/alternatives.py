@@ -167,6 +167,15 @@ def _with_path(holder: str, path: Callable[[tuple[str, ...]], tuple[str, ...]]) 
     return lambda instrument: instrument.changed(holder, path=path)
 
 
+def _without(holder: str, name: str) -> Rearrangement:
+    """Take an element out of an arm, or of the common train: effects that act on it do not apply any longer."""
+    return lambda instrument: instrument.changed(
+        holder,
+        path=lambda way: tuple(n for n in way if n != name),
+        elements=lambda elements: tuple(element for element in elements if element.name != name),
+    )
+
+
 def _in_or_out(instrument: Instrument) -> Iterator[NamedChange]:
     for place, plate in _used(instrument, WavePlate).items():
         if plate.moves:
@@ -185,8 +194,7 @@ def _in_or_out(instrument: Instrument) -> Iterator[NamedChange]:
             bends = type(element).ray is not Element.ray  # without it all elements behind would be displaced
             if isinstance(element, Polariser | Analyser) or element.moves or bends:
                 continue
-            without = _with_path(holder, lambda way, out=name: tuple(n for n in way if n != out))
-            yield f"{prefix}{name} left out", without
+            yield f"{prefix}{name} left out", _without(holder, name)
 
 
 def _dispersion(instrument: Instrument) -> Iterator[NamedChange]:

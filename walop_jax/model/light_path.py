@@ -173,6 +173,12 @@ class LightPath(Component):
 
     # ------------------------------------------------------------------------------- changing it
 
+    def as_put_together(self) -> Self:
+        """The instrument with its structural effects made (a plate left out, say); all others stay effects."""
+        structural = tuple(effect for effect in self.effects if effect.kind.is_structural())
+        others = tuple(effect for effect in self.effects if not effect.kind.is_structural())
+        return dataclasses.replace(dataclasses.replace(self, effects=structural).patched(), effects=others)
+
     def patched(self) -> Self:
         """The instrument with the changes of its effects made, and without the effects themselves."""
         bare = dataclasses.replace(self, effects=())

@@ -223,8 +223,8 @@ class Effect(Component):
         return self
 
     def lacks(self, instrument: Instrument) -> str:
-        """The part that the instrument lacks for the effect, in words; empty where it fits."""
-        return _lacking(self, dataclasses.replace(instrument, effects=()))
+        """The part that the instrument, as it was put together, lacks for the effect; empty where it fits."""
+        return _lacking(self, dataclasses.replace(instrument.as_put_together(), effects=()))
 
 
 def _in_print(value: Any, unit: str) -> str:
