@@ -130,7 +130,10 @@ class Screen:
         values = np.asarray(values_of(instrument))
         if len(values) != len(self.values):
             return None
-        model = dataclasses.replace(self.likelihood.model, template=instrument)
+        own = self.likelihood.model
+        # The exposures are laid out for the start values, and an exchange of layers exchanges these as well.
+        started = [dataclasses.replace(p, start=v, tie=None) for p, v in zip(own.parameters, values.tolist(), strict=True)]
+        model = dataclasses.replace(own, template=instrument, parameters=tuple(started))
         return Likelihood.of(item.change(self.calset), model), values
 
     def best(self, items: Iterable[Alternative], most: int = BEST, share: float = 1.0) -> list[Alternative]:

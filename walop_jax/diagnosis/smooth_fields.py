@@ -107,8 +107,12 @@ class SmoothFields:
         sums = np.zeros((self._terms.shape[1], len(self._place), rows.shape[1]))
         for point, at in enumerate(self._rows_of_points):
             sums += self._terms[point][:, None, None] * (self._columns[at].T @ rows[at])
+        count, columns = len(sums), rows.shape[1]
         return np.concatenate(
-            [sums[:, places].swapaxes(0, 1).reshape(-1, rows.shape[1]) for places in self._of]
+            [
+                sums[:, of].swapaxes(0, 1).reshape(count * len(field.changes), columns)
+                for of, field in zip(self._of, self.fields, strict=True)
+            ]
         )
 
     def columns(self, name: str) -> AnyMatrix:
