@@ -227,6 +227,18 @@ def test_products_are_those_of_columns_written_out(examined, name):
     assert np.abs(across - expected).max() < 1e-5 * norm.max()
 
 
+def test_a_set_in_which_no_single_exposure_can_be_disturbed_has_smooth_fields_all_the_same(examined):
+    """Z has no columns then: the Gram matrices are those behind the free parameters alone."""
+    free, _ = examined.smooth.bases
+    smooth = dataclasses.replace(examined.smooth, bases=(free, np.zeros((len(free), 0))))
+    assert smooth.products(smooth.bases[1]).shape == (sum(smooth.sizes), 0)
+    name = PLACES[0]
+    number = smooth.names.index(name)
+    written = examined.design.projector(examined.design.stacked([smooth.candidate(name).columns]))
+    gram = smooth.grams[number]
+    assert np.abs(written.T @ written - gram).max() < 1e-5 * np.diag(gram).max()
+
+
 def test_evidence_beside_a_smooth_field_is_a_ratio_of_densities(examined):
     """ln p(r | field and g) − ln p(r | field) of normal residuals, by the determinant lemma on columns written out."""
     candidates, smooth, design = JointScores(examined), examined.smooth, examined.design

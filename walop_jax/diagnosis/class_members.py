@@ -45,8 +45,6 @@ from walop_jax.model.effects.change import KINDS, Change, patched
 from walop_jax.model.effects.in_models import effects_of
 
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
-LINEAR = 0.01  # relative error of the evidence of a linear step
-PLAUSIBLE = 0.02  # probability of members in the check of the farthest
 
 
 def classes_of(
@@ -186,7 +184,7 @@ class LinearisedFit:
         """
         if self.state.scatter > 1.0:
             return best
-        return min(best, evidence + max(thresholds.LINEAR_GOOD, LINEAR * abs(best)))
+        return min(best, evidence + max(thresholds.LINEAR_GOOD, thresholds.LINEAR * abs(best)))
 
     def _spread(self, members: Sequence[ClassMember]) -> tuple[float, float, float]:
         """Error of p of stars between members, error of the fit, and largest deviation of a member (`ClassOf`)."""
@@ -196,7 +194,7 @@ class LinearisedFit:
         between = np.einsum("k,kpi,kpj->pij", weights, away, away)
         total = np.sqrt(self.errors**2 + np.diagonal(between, axis1=1, axis2=2))
         far = np.median(np.abs(away) / np.where(total > 0, total, np.inf), axis=1).max(axis=1)
-        off = float(far[weights > PLAUSIBLE].max(initial=0.0))
+        off = float(far[weights > 1.0 - thresholds.CERTAIN].max(initial=0.0))
         return self.error_of_p(between), self.stated, off
 
     @functools.cached_property
@@ -352,7 +350,7 @@ class LinearStep:
         name = "; ".join(description.text for description in changes_in(sums))
         twin = self.member(name, sums, column, widths)
         # It is the same difference between KINDs, told from the other side: as probable, whatever the throughputs are.
-        alike = max(thresholds.EVEN_ODDS, LINEAR * abs(member.evidence))
+        alike = max(thresholds.EVEN_ODDS, thresholds.LINEAR * abs(member.evidence))
         near = abs(twin.evidence - member.evidence) < alike
         return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
 

@@ -42,7 +42,7 @@ from walop_jax.diagnosis.readings import (
 )
 from walop_jax.diagnosis.screen import BEST, STEPS, Screen, Stepping, applied, misfit_after
 from walop_jax.diagnosis.stated_conditions import STEP, stated_numbers
-from walop_jax.fit.refit import FitResult
+from walop_jax.fit.refit import NEARLY, FitResult
 from walop_jax.fit.search import FAR_OFF
 from walop_jax.io.errors import DataError
 from walop_jax.io.progress import Tell
@@ -149,23 +149,25 @@ def _compared(
         Alternative(effect.name, "add it to the model", effects=(effect,)) for effect in structural
     ]
     of_some = list(of_some_exposures(likelihood, _worst_exposures(likelihood, values)))
-    if _most_missed(likelihood, values) < thresholds.READING_COARSE:
+    if _most_missed(likelihood, values) < thresholds.LINEAR:
         return look.explaining(of_some, look.enough)
     tell("comparing discrete causes: plates, beams and cables, signs, zeros and units of the data")
     of_all = list(readings(few, model))
     # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
     of_data = [*of_some, *of_all]
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
-    sure, far_off = thresholds.READING_SURE, left >= FAR_OFF
+    far_off = left >= FAR_OFF
     if not far_off:
         # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
-        return look.first_of([lambda: of_data, lambda: look.screen.in_parts(of_all)], min(look.enough, sure))
+        return look.first_of(
+            [lambda: of_data, lambda: look.screen.in_parts(of_all)], min(look.enough, NEARLY)
+        )
     whole: list[CauseSearch] = [lambda: look.screen.best(of_instrument), lambda: of_data]
     if found := look.first_of(whole, look.enough):
         return found
     if descriptions and (found := _stated_otherwise(likelihood, left, values)):
         return found
-    if found := look.first_of([lambda: look.screen.in_parts(of_all), look.screen.steps], sure):
+    if found := look.first_of([lambda: look.screen.in_parts(of_all), look.screen.steps], NEARLY):
         return found
     tell("comparing two mistakes of the data at once")
     if found := look.pairs(of_data):
@@ -187,7 +189,7 @@ def _compared(
     if found := look.pairs([*of_instrument, *of_data, *described]):
         return found
     near = sorted(look.near, key=_left)
-    return tuple(item for item in near if item.explained < thresholds.READING_ALIKE * near[0].explained)
+    return tuple(item for item in near if item.explained < thresholds.POOR_FIT * near[0].explained)
 
 
 def _stated_otherwise(likelihood: Likelihood, left: float, values: Vector) -> tuple[Alternative, ...]:
@@ -210,7 +212,7 @@ def _stated_otherwise(likelihood: Likelihood, left: float, values: Vector) -> tu
         return ()
     found = screen.determined(best[0], every, best[1], "")
     found = _judged(found, likelihood.calset, likelihood.model, left, STEPS[1])
-    if found.explained >= thresholds.READING_SURE:
+    if found.explained >= NEARLY:
         return ()
     number = f"{found.what} ({found.remedy}; χ²/dof = {found.explained:.3g})"
     return (dataclasses.replace(found, number=number, change=unchanged),)
@@ -269,7 +271,7 @@ class _Look:
         """The causes of the first stage that leave nothing but noise, best first; empty: none."""
         for stage in stages:
             found = self.explaining(stage(), enough)
-            if found and found[0].explained < thresholds.READING_SURE:
+            if found and found[0].explained < NEARLY:
                 return found
             self.near += found  # another cause may explain all
         return ()
@@ -289,7 +291,7 @@ class _Look:
         if not good:
             return ()
         place, least = {item.what: n for n, item in enumerate(items)}, good[0].explained
-        alike = [item for item in good if item.explained < thresholds.READING_ALIKE * least]
+        alike = [item for item in good if item.explained < thresholds.POOR_FIT * least]
         # Within an odds ratio of e³ the data do not say which: the commoner one is listed first.
         free = max(self.likelihood.used_data.n_data, 1)
         equal = least + 2.0 * thresholds.EVEN_ODDS / free
@@ -314,7 +316,7 @@ class _Look:
             others = (item for item in items if item.what != first.what)
             seconds = screen.best(others, share=1.0 / thresholds.PART)
             both = [first.beside(second) for second in seconds]
-            if found := self.explaining(both, thresholds.READING_SURE, STEPS[1]):
+            if found := self.explaining(both, NEARLY, STEPS[1]):
                 return found
         return ()
 

@@ -377,7 +377,7 @@ class Examination(Evidence):
     def is_like(self, design: Design) -> bool:
         """True if the expected counts of another fit are close enough to reuse its columns."""
         ours, theirs = (of.measured.counts_changed_by(GAIN) for of in (self.design, design))
-        return bool(np.linalg.norm(ours - theirs) < thresholds.SAME_COUNTS * np.linalg.norm(ours))
+        return bool(np.linalg.norm(ours - theirs) < thresholds.LINEAR * np.linalg.norm(ours))
 
 
 def examine(

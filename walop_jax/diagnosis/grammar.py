@@ -311,7 +311,6 @@ def _of_cameras(
 SUDDEN = ("step", "side", "night")  # laws of changes that begin or end at some time
 STEPS, FEW = 16, 18  # times of a step in the first search; most times for which all spells are tried
 AFTER = 0.5  # hours behind the last exposure that a step ends
-NEARLY_TIME = 0.999  # correlation of the order of exposures with time
 
 
 def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
@@ -401,7 +400,7 @@ class Dependences:
         """True where the order of the exposures is not degenerate with time."""
         hours, order = hours_of(self.exposures), np.arange(len(self.exposures), dtype=float)
         timed = varies(self.exposures.mjd) and len(order) > 2
-        return bool(timed and abs(np.corrcoef(hours, order)[0, 1]) < NEARLY_TIME)
+        return bool(timed and abs(np.corrcoef(hours, order)[0, 1]) < thresholds.SAME)
 
     def _side(self) -> Iterator[tuple[str, ...]]:
         """The side from which a moving element came, where it came from both."""

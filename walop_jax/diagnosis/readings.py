@@ -19,6 +19,7 @@ from jaxtyping import Bool
 from walop_jax.data.kinds import POLARISER
 from walop_jax.data.records import Block, CalibrationSet, Exposures, Points, Position, Sources
 from walop_jax.data.table_intensities import TableIntensities
+from walop_jax.diagnosis import thresholds
 from walop_jax.fit.refit import FitResult
 from walop_jax.instruments.description import shipped
 from walop_jax.io.errors import DataError
@@ -29,8 +30,7 @@ from walop_jax.model.effects import Effect
 from walop_jax.model.specification import Model
 
 FEW = 64  # field points up to which sets are looked at whole
-_NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing, …
-_MISSING = 20.0  # … if as many standard errors are missing
+_NO_LIGHT = 0.05  # of the expected light, below which a camera sees nothing
 _FIELD = 1.5  # of the designed field: what a field in other units must fit into
 _FEW_FILTERS = 4  # up to which any two may be exchanged
 _LISTED = 8  # exposures that a sentence lists
@@ -272,7 +272,9 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
     exposures = np.flatnonzero(block.used.any(axis=0))
     expected = np.nanmedian((block.counts - lacking * block.sigma)[:, exposures], axis=0)
     level = np.nanmedian(np.where(block.used[..., None], block.counts, np.nan)[:, exposures], axis=0)
-    dead = (level < _NO_LIGHT * expected) & (np.nanmedian(lacking[:, exposures], axis=0) < -_MISSING)
+    dead = (level < _NO_LIGHT * expected) & (
+        np.nanmedian(lacking[:, exposures], axis=0) < -thresholds.SEPARATION
+    )
     for k in np.flatnonzero(dead.any(axis=0) & ~dead.all(axis=0)):
         off = exposures[dead[:, k]]
         listed = some([str(number) for number in calset.exposures.exposure[off]], 6)

@@ -28,7 +28,7 @@ from walop_jax.diagnosis.refits import (
 )
 from walop_jax.diagnosis.score import local_p
 from walop_jax.diagnosis.search import State
-from walop_jax.diagnosis.stated_conditions import ALIKE, Singles, condition_scores
+from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.text import with_error
 from walop_jax.likelihood import limits
@@ -271,7 +271,11 @@ def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterat
     square = float(np.sum(design.projector(design.residual) ** 2))
     least = special.chdtri(1, local_p(thresholds.ALARM, len(scored)))
     gains = [float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) for item in scored]
-    likely = [k for k, gain in enumerate(gains) if (square - gain) * errors < chi2 + ALIKE and gain > least]
+    likely = [
+        k
+        for k, gain in enumerate(gains)
+        if (square - gain) * errors < chi2 + 2.0 * thresholds.IMPROBABLE and gain > least
+    ]
     if likely:
         likely.sort(key=lambda k: -gains[k])
         shown = (scored[k] for k in likely[: thresholds.SHOWN])
@@ -345,7 +349,8 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
     added = after is not before
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
     clear = conditions.clear
-    alike = [item for item in clear if item.score.statistic > clear[0].score.statistic - ALIKE]
+    least_gain = clear[0].score.statistic - 2.0 * thresholds.IMPROBABLE if clear else 0.0
+    alike = [item for item in clear if item.score.statistic > least_gain]
     for current in alike[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
         for _ in range(_ROUNDS):  # Gauss–Newton steps: a clock wrong by hours is not in the linear range

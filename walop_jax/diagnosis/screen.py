@@ -132,7 +132,10 @@ class Screen:
             return None
         own = self.likelihood.model
         # The exposures are laid out for the start values, and an exchange of layers exchanges these as well.
-        started = [dataclasses.replace(p, start=v, tie=None) for p, v in zip(own.parameters, values.tolist(), strict=True)]
+        started = [
+            dataclasses.replace(p, start=v, tie=None)
+            for p, v in zip(own.parameters, values.tolist(), strict=True)
+        ]
         model = dataclasses.replace(own, template=instrument, parameters=tuple(started))
         return Likelihood.of(item.change(self.calset), model), values
 

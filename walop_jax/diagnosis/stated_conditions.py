@@ -44,8 +44,6 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.laws import YEAR
 
-ALIKE = 2.0 * thresholds.IMPROBABLE  # in χ², within which conditions are reported together
-_PRIOR_WIDTHS = 30.0  # by which a prior may be wrong at most
 _ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
@@ -206,7 +204,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     rest = square - best.statistic * singles.noise_scale**2
     if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    least = best.statistic - best.rank - ALIKE
+    least = best.statistic - best.rank - 2.0 * thresholds.IMPROBABLE
     likely = [item for item in clear if item.score.statistic - item.score.rank > least]
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item.score, rival.score) for rival in likely)]
@@ -261,7 +259,7 @@ def _priors(design: Design) -> Iterator[Single]:
     for name, members in elements.items():
         columns = np.zeros((len(design.residual), len(members)))
         columns[design.rows + np.array(members), np.arange(len(members))] = 1.0
-        yield Single(Candidate(name, columns, np.full(len(members), _PRIOR_WIDTHS)), wording)
+        yield Single(Candidate(name, columns, np.full(len(members), thresholds.MOST_WIDTHS)), wording)
 
 
 def _of_cameras(design: Design) -> Iterator[Single]:

@@ -1,7 +1,8 @@
 """Descriptions that say what another candidate says: one candidate with several names.
 
 Data        Behind the free parameters the columns C of two candidates with k amplitudes span the same changes of the
-            residuals, where the cosines of the angles between the two spans are 1: Σ (1 − cos²) < 1 − SAME².
+            residuals, where the cosines of the angles between the two spans are 1: Σ (1 − cos²) < 1 − S² with
+            S = `thresholds.SAME`.
 Product     What both do to the instrument matrix, refitted, is the same: with D the change of the matrix by the
             amplitudes, directly and through the shift of the free parameters, and b = T a the amplitudes of the first
             candidate that imitate amplitudes a of the second one best, D₂ a − D₁ T a is less than `ALIKE` of the errors
@@ -24,6 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe, texts_of
 from walop_jax.diagnosis.score import Candidate, ScoreSpace
@@ -32,7 +34,6 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 
 ALIKE = 0.5  # of the errors of the matrix: changes of it that differ by less are the same
-SAME = 0.999  # correlation of columns from which on they are the same to the data
 
 
 def synonyms(
@@ -96,7 +97,7 @@ def _spans_are_the_same(
         whitened[own, own] = space.whitened[probe.name]
     cosines = whitened.T @ space.gram[np.ix_(at, at)] @ whitened
     squares = np.sum(cosines.reshape(len(places), rank, len(places), rank) ** 2, axis=(1, 3))
-    return rank - squares < 1.0 - SAME**2
+    return rank - squares < 1.0 - thresholds.SAME**2
 
 
 def _changes(

@@ -28,10 +28,13 @@ MOST_SENTENCES = 2
 MOST_TOGETHER = 4  # numbers of one thing that are tried together: members of a group of descriptions, priors
 MOST_FITTED = 4  # shapes of one effect from which it is fitted; other descriptions that are fitted
 LINEAR_GOOD = 1.0  # evidence by which members of a class that were fitted may differ from their linear steps
-SAME_COUNTS = 0.01  # relative change of the counts up to which columns of an earlier model serve again
+# Relative change of the counts up to which linear steps are right: columns of an earlier model serve again, no
+# reading of the data is asked, and the evidence of a linear step is known to this share of it.
+LINEAR = 0.01
+SAME = 0.999  # correlation of two columns from which on they are the same to the data
 POOR_FIT = 1.5  # χ²/dof above which structural effects and other descriptions are tried
 GOOD_SHARE = 0.5  # share of the misfit that a name must explain for these not to be tried
-FLOOR = 1.25  # σ of the residuals behind all candidates above which evidence counts in that unit
+FLOOR = math.sqrt(POOR_FIT)  # σ of residuals behind all candidates above which evidence counts in that unit
 
 # Additions
 
@@ -46,7 +49,7 @@ EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
 # class are averaged.
 IMPROBABLE = 6.9
 USEFUL = 2.0  # standard errors by which a term without a name must predict unseen settings better to be kept
-MOST_WIDTHS = 10.0  # prior widths beyond which an amplitude of an optical description explains nothing
+MOST_WIDTHS = PART  # prior widths by which an amplitude of an optical description, or a prior, may be off
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
 MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
 
@@ -62,9 +65,6 @@ PROBABILITY = 0.99  # probability with which an effect at its detection limit is
 # Other descriptions of the instrument, other readings of the data
 
 LEAST_GAIN = 12.0  # gain in χ² behind one linear step above which a description is worth a fit
-READING_COARSE = 0.01  # share of the light that a fit of mixed-up data misses at least
-READING_ALIKE = 1.5  # factor in χ² within which two readings are both reported
-READING_SURE = 1.2  # χ²/dof up to which another reading explains the data, before anything is looked for
 
 # Candidates and time
 

@@ -45,7 +45,7 @@ from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import fit, with_empirical_covariance
+from walop_jax.fit.refit import NEARLY, fit, with_empirical_covariance
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
@@ -95,7 +95,7 @@ def diagnose(
     structural = [effect.neutral(context) for effect in candidates.effects if effect.is_structural()]
     # Amplitudes mean nothing where the model is far off: causes without an amplitude are tried first.
     left, causes = (np.nan, ()) if as_written else causes_before_a_fit(sample, model, structural, tell)
-    if causes and causes[0].of_data and causes[0].explained < thresholds.READING_SURE:
+    if causes and causes[0].of_data and causes[0].explained < NEARLY:
         raise refusal(left, causes)
     before = fit(Likelihood.of(sample, model))
     far_off = before.noise_scale > 1.0
@@ -103,7 +103,7 @@ def diagnose(
         causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
     number = causes[0].number if causes else ""
     left = before.chi2 / max(before.dof, 1)
-    if causes and causes[0].of_data and (far_off or causes[0].explained < thresholds.READING_SURE):
+    if causes and causes[0].of_data and (far_off or causes[0].explained < NEARLY):
         raise refusal(left, causes)
     judge = Refits(
         hypotheses=candidates,
