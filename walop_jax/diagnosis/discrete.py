@@ -309,12 +309,15 @@ class _Look:
         firsts = sorted((item for item in self.tried if item.explained < _HELPS * stands), key=_left)
         for first in firsts[:BEST]:
             try:
-                calset, model = applied(first, self.calset, self.model)
-                screen = Screen(Likelihood.of(calset, model), first.explained)
+                likelihood = Likelihood.of(*applied(first, self.calset, self.model))
+                screen = Screen(likelihood, first.explained)
+                _, values = misfit_after(likelihood, first.explained, STEPS[1])
             except (ValueError, np.linalg.LinAlgError):
                 continue
-            others = (item for item in items if item.what != first.what)
-            seconds = screen.best(others, share=1.0 / thresholds.PART)
+            # Once the first one is undone, other exposures are the worst.
+            of_some = of_some_exposures(likelihood, _worst_exposures(likelihood, values))
+            others = {item.what: item for item in (*items, *of_some) if item.what != first.what}.values()
+            seconds = screen.best(others)
             both = [first.beside(second) for second in seconds]
             if found := self.explaining(both, NEARLY, STEPS[1]):
                 return found

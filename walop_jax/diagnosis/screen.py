@@ -139,13 +139,13 @@ class Screen:
         model = dataclasses.replace(own, template=instrument, parameters=tuple(started))
         return Likelihood.of(item.change(self.calset), model), values
 
-    def best(self, items: Iterable[Alternative], most: int = BEST, share: float = 1.0) -> list[Alternative]:
-        """The `most` causes that leave less than a `share` of what nothing changed does, and least, in their order."""
+    def best(self, items: Iterable[Alternative], most: int = BEST) -> list[Alternative]:
+        """The `most` causes that leave less than what nothing changed does, and least, in their order."""
         stands, ranked = self.misfit, []
         for item in items:
             if (rows := self.changed(item)) is not None:
                 square, along = (part.sum(axis=0) for part in self.sums(rows))
-                if (left := float(self.left(square, along))) < share * stands:
+                if (left := float(self.left(square, along))) < stands:
                     ranked.append((left, item))
         return _least(ranked, most)
 
