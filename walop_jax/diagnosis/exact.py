@@ -34,10 +34,10 @@ from walop_jax.diagnosis.findings import Choice, FitComparison
 from walop_jax.diagnosis.hypotheses import Ranked, texts_of
 from walop_jax.diagnosis.score import SCALES, log_bayes
 from walop_jax.fit.refit import PRIOR_EDGE, FitResult, fit
-from walop_jax.io.shapes import Vector
+from walop_jax.io.shapes import AnyVector, Vector
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.alternatives import JOINED, alternatives, other_curves
+from walop_jax.model.alternatives import JOINED, alternatives, changed, other_curves
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
 from walop_jax.model.effects.in_models import effect_context, model_without, with_descriptions, with_effects
 from walop_jax.model.light_path import NoSuchPlaceError
@@ -375,6 +375,20 @@ def other_descriptions(
     return trials, compared
 
 
+def _residuals_otherwise(design: Design, sentence: str) -> AnyVector:
+    """The residuals of a fit with the instrument described otherwise, at its values, by rows of data."""
+    model, values, calset = design.fit.model, design.fit.values, design.fit.calset
+    otherwise = None
+    if OtherDescription.name not in model.effect_names:
+        otherwise = model.rearranged(values, lambda bare: changed(bare, sentence))
+    if otherwise is None:
+        otherwise = described_otherwise(model, sentence, calset)
+    else:
+        values = otherwise.start
+    residual = Likelihood.of(calset, otherwise).residuals(values)[1]
+    return residual[design.measured.used].reshape(-1)
+
+
 def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Choice, float, Vector]]:
     """Every change that alters the residuals: as a `Choice` with the fraction left, its gain in χ², its start values.
 
@@ -390,14 +404,13 @@ def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Cho
     places = list(map(Design.of, fits))
     reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
-        try:
-            model = described_otherwise(result.model, sentence, calset)
-        except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
-            continue
-        changed, ratios = Likelihood.of(calset, model), []
+        ratios = list[float]()
         for design in places:
+            try:
+                residual = _residuals_otherwise(design, sentence)
+            except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
+                break
             rows = design.residual.copy()
-            residual = changed.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
             rows[: design.rows] = residual / design.fit.noise_scale
             if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
                 break

@@ -14,7 +14,6 @@ Limits      Slopes are those of the model as it stands: the screen ranks, `discr
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -32,8 +31,8 @@ from walop_jax.fit.model_of_set import model_like
 from walop_jax.io.shapes import Vector
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import with_effects
+from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import NoSuchPlaceError
-from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model
 
 STEPS = (1, 6)  # Gauss–Newton steps at the first look, and of the best
@@ -107,7 +106,7 @@ class Screen:
             if item.effects and not self.likelihood.model.effect_names:
                 arranged = self._arranged(item)
             if arranged is not None:
-                rows = self.rows(*arranged)
+                rows = self.rows(Likelihood.of(item.change(self.calset), arranged), arranged.start)
             else:
                 calset, model = applied(item, self.calset, self.likelihood.model)
                 # Parameters of standards follow the catalogue: other values there are other values of these.
@@ -118,26 +117,13 @@ class Screen:
             return None
         return rows if np.isfinite(rows).all() else None
 
-    def _arranged(self, item: Alternative) -> tuple[Likelihood, Vector] | None:
-        """The likelihood of an instrument that is arranged as a cause says, at the values of the screen.
+    def _arranged(self, item: Alternative) -> Model | None:
+        """The model of an instrument that is arranged as a cause says, with the values of the screen as its start."""
 
-        Arranged in place, not by an effect: instruments that differ in the angles of their plates share a program. None
-        where the cause takes out an element, and its parameters with it.
-        """
-        instrument = self.likelihood.model.instrument(self.values)
-        for effect in item.effects:
-            instrument = effect.patch(instrument)
-        values = np.asarray(values_of(instrument))
-        if len(values) != len(self.values):
-            return None
-        own = self.likelihood.model
-        # The exposures are laid out for the start values, and an exchange of layers exchanges these as well.
-        started = [
-            dataclasses.replace(p, start=v, tie=None)
-            for p, v in zip(own.parameters, values.tolist(), strict=True)
-        ]
-        model = dataclasses.replace(own, template=instrument, parameters=tuple(started))
-        return Likelihood.of(item.change(self.calset), model), values
+        def arrange(instrument: Instrument) -> Instrument:
+            return functools.reduce(lambda made, effect: effect.patch(made), item.effects, instrument)
+
+        return self.likelihood.model.rearranged(self.values, arrange)
 
     def best(self, items: Iterable[Alternative], most: int = BEST) -> list[Alternative]:
         """The `most` causes that leave less than what nothing changed does, and least, in their order."""

@@ -7,7 +7,7 @@ tree as well (`parameters.leaves`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -196,6 +196,23 @@ class Model:
         if values is None or not isinstance(values, jax.Array):
             values = np.asarray(self.start if values is None else values, float)
         return with_values(self.template)(values)
+
+    def rearranged(self, values: Vector, arrange: Callable[[Instrument], Instrument]) -> Model | None:
+        """The model of the instrument at `values` (n) with its elements arranged otherwise, which are its start values.
+
+        `arrange` is given the bare instrument; its effects act on what comes back. Unlike an effect that does the same,
+        this keeps the structure: instruments that differ in the angles of their plates share a program. Ties are
+        undone, since an exchange of layers exchanges their parameters. None comes back where an element, and its
+        parameters with it, was taken out.
+        """
+        built = self.instrument(values)
+        template = dataclasses.replace(arrange(dataclasses.replace(built, effects=())), effects=built.effects)
+        start = np.asarray(values_of(template)).tolist()
+        if len(start) != len(self.parameters):
+            return None
+        parameters = zip(self.parameters, start, strict=True)
+        started = tuple(dataclasses.replace(p, start=value, tie=None) for p, value in parameters)
+        return dataclasses.replace(self, template=template, parameters=started)
 
 
 def _wave_plates(instrument: Instrument) -> Iterator[tuple[str, WavePlate]]:
