@@ -15,6 +15,7 @@ from walop_jax.diagnosis import search, workflow
 from walop_jax.diagnosis.discrete import _most_missed, causes, causes_before_a_fit
 from walop_jax.diagnosis.exact import Trial
 from walop_jax.diagnosis.findings import FitComparison
+from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.readings import Alternative, _columns_exchanged, _filters, in_some_exposures
 from walop_jax.diagnosis.screen import stepping
 from walop_jax.diagnosis.workflow import diagnose
@@ -23,9 +24,10 @@ from walop_jax.fit.refit import FitResult
 from walop_jax.io.errors import DataError
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.alternatives import changed
-from walop_jax.model.effects import Described, OtherDescription, effect_by_name
+from walop_jax.model.effects import EFFECTS, Described, OtherDescription, effect_by_name
 from walop_jax.model.effects.base import Effect
 from walop_jax.model.effects.change import Change
+from walop_jax.model.effects.in_models import with_effects
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.simulation.simulate import simulate
 
@@ -119,6 +121,51 @@ def test_two_mistakes_at_once_are_told_together(sound):
     assert "the columns of N were in the order E1, O1, O2, E2" in told.what
     assert "X runs the other way" in told.what
     assert ", and " in told.what
+
+
+def test_the_second_mistake_is_sought_where_the_first_one_was_not(sound):
+    """Angles of the polariser that are 45° off hide standards of the other sign: these are not among the worst."""
+    stars = dataclasses.replace(sound.sources, u=-sound.sources.u)
+    calset = dataclasses.replace(sound, sources=stars)
+    told = found(with_polariser(calset, calset.exposures.position("CLP").angle + 45.0))
+    assert told.what == "CLP_ANGLE is 135° too small, and U of SOURCES had the other sign"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "half2.plate with layers in the other order",
+        "half1.plate turned by 90 deg",
+        "collimator behind pupil",
+    ],
+)
+def test_an_instrument_rearranged_in_place_is_the_one_with_the_effect(sound, change):
+    """Number for number, on the nodes of the instrument as it was: an exchange of layers makes no plate thicker."""
+    model = base_model(sound)
+    values = model.start * (1.0 + 1e-3 * np.arange(len(model.start)) / len(model.start))
+    values = model.full(values[model.free])
+    otherwise = model.rearranged(values, lambda bare: changed(bare, change))
+    likelihood = Likelihood.of(sound, otherwise)
+    effect = OtherDescription(change=change)
+    theirs = Likelihood.of(sound, with_effects(model, [effect], sound)).residuals(values)[1]
+    ours = likelihood.residuals(otherwise.start)[1]
+    assert np.abs(ours - theirs).max() < 1e-9 * np.abs(theirs).max()
+    assert likelihood.plan.wavelength.shape == Likelihood.of(sound, model).plan.wavelength.shape
+
+
+def test_what_is_taken_out_has_no_parameters_in_its_place_and_no_candidates(sound):
+    """Half 2 without its plate: nothing acts on the plate, and all other candidates stay."""
+    model, change = base_model(sound), "half2.plate left out"
+    assert model.rearranged(model.start, lambda bare: changed(bare, change)) is None
+    without = with_effects(model, [OtherDescription(change=change)], sound).template
+    listed, before = (
+        {probe.name for probe in hypotheses(EFFECTS, t, sound.exposures, len(sound.points)).beside(())}
+        for t in (without, model.template)
+    )
+    assert not [name for name in listed if "half2.plate" in name]
+    assert "hwp2_axis" in before - listed
+    # What was said of the plate is said of its neighbours; of half 1, cameras and sources all is as it was.
+    assert {name for name in before if "half1" in name and "half2" not in name} <= listed
 
 
 @pytest.mark.parametrize("change", ["half1.plate and half2.plate exchanged", "half2.wedge turned by 180 deg"])

@@ -152,6 +152,32 @@ def test_two_names_come_before_a_pattern_that_holds_both(seed):
     assert sorted(getattr(thing.candidate, "name", "") for thing in things) == ["clp_zero", "rotator_zero"]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_two_effects_come_before_a_description_that_holds_both(seed):
+    """No exchange leads from the description to both; two amplitudes are more probable than four that do the same."""
+    a, b, *others = (v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((4, ROWS)))
+    columns = {
+        "clp_zero": a[:, None],
+        "rotator_zero": b[:, None],
+        "turn of polariser": np.stack([a, b, *others], axis=1),
+        "gain of O1": others[0][:, None],
+    }
+    found, *_ = scene({"clp_zero": [25.0], "rotator_zero": [-25.0]}, 300 + seed, columns, 25.0)
+    scores = JointScores(found)
+    assert [scores.names[number] for number, _ in scores._grown([])] == ["turn of polariser"]
+    assert sorted(t.candidate.name for t in most_probable(found).things) == ["clp_zero", "rotator_zero"]
+
+
+@pytest.mark.parametrize("members", [(), ("gain of O1",), ("clp_zero", "turn of polariser")])
+def test_effects_asked_alone_have_the_evidence_that_they_have_among_all(members):
+    scores = JointScores(scene({"clp_zero": [9.0]})[0])
+    of = [(scores.names.index(name), 1.0) for name in members]
+    every, alone = scores.beside(of), scores.beside(of, effects_alone=True)
+    effects = scores._is_effect
+    assert np.allclose(alone[effects], every[effects], rtol=1e-12, atol=1e-12)
+    assert np.isneginf(alone[~effects]).all()
+
+
 def test_the_set_of_a_thing_holds_names_that_are_the_same_to_the_data():
     """Two columns that are equal: half of the probability each where both are equally probable beforehand."""
     rng = np.random.default_rng(1)

@@ -120,7 +120,9 @@ def homes_of(where: str, law: str) -> set[str]:
 
 def home_of(sentence: str, instrument: Instrument) -> str:
     """The place that a description of a diagnosis names."""
-    change = Change.parsed(sentence.replace(" * smooth", ""))  # any pattern over the field is at the same home
+    change = Change.parsed(
+        sentence.replace(" * smooth", "")
+    )  # any pattern over the field is at the same home
     polariser, arms = instrument.polariser, [arm.name for arm in instrument.arms]
     arm = change.place.split(".")[0]
     if change.kind.split()[0] in ("gain", "light", "afterglow"):
