@@ -42,6 +42,9 @@ OTHERS = {
     "CERTAIN": (0.9, 0.99),
     "MOST_STEPS": (3, 12),
     "MOST_SENTENCES": (1, 4),
+    "IMPROBABLE": (4.6, 9.2),
+    "SEPARATION": (2.5, 3.5),
+    "FLOOR": (1.1, 1.5),
 }
 """A smaller and a larger value of each."""
 
