@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -20,11 +21,13 @@ from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.score import Projector
 from walop_jax.diagnosis.trust import examined, group_scores
 from walop_jax.fit import refit as fitting
+from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import Doubt, Quality, Verdict
+from walop_jax.model.noise import with_noise
 from walop_jax.posterior.sampling import sample
 from walop_jax.simulation.observing_plan import ObservingPlan
-from walop_jax.simulation.simulate import simulate
+from walop_jax.simulation.simulate import effect_from_text, simulate
 
 
 def refit(calset: CalibrationSet) -> FitResult:
@@ -262,3 +265,14 @@ def test_a_plan_without_noise_is_not_held_against_its_errors(clean):
     found = refit(simulate(SMALL, seed=7, noiseless=True).calset)
     assert (found.trusted, found.warnings) == (True, ())
     np.testing.assert_allclose(found.sigma[found.sigma > 0], clean.sigma[clean.sigma > 0], rtol=0.1)
+
+
+def test_fitted_errors_that_take_a_misfit_for_noise_are_not_trusted():
+    """Light of a camera in another one, ten times the usual share: the errors are fitted as tens of N_ERR."""
+    calset = simulate(
+        SMALL, seed=6001, effects=[effect_from_text("camera_leakage=0.02", SMALL.context())]
+    ).calset
+    found = examined(fitting.refit(calset, with_noise(base_model(calset), scale="all")))
+    assert not found.trusted
+    said = str(found.verdict)
+    assert re.search(r"the errors are fitted as \d{2}(\.\d)? times N_ERR \(noise\.scale\)", said)

@@ -64,6 +64,7 @@ from walop_jax.io.text import beside, some
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import known_effects
+from walop_jax.model.noise import COMMON
 
 TRUST_ROWS = 20_000
 """(Exposure, point) pairs whose residuals are searched for patterns after every fit: a second, and half a GB."""
@@ -138,7 +139,7 @@ def examined(
     else:  # anything may be in such residuals; what single places of the field share sits on stars as well
         components = [component for component in components if component.grouping.structure]
         doubts = (*stated_conditions(design), *in_words(components))
-    doubts = (*doubts, *_finer(result))
+    doubts = (*doubts, *_finer(result), *_fitted_errors(result))
     structure = structure_of(components)
     final = with_empirical_covariance(result)
     if structure:
@@ -149,6 +150,16 @@ def examined(
     for what in singles.of_noise if singles is not None else ():
         final = final.with_remark(MADE_OF_N.format(what))
     return dataclasses.replace(final, hidden=hidden)
+
+
+def _fitted_errors(result: FitResult) -> Iterator[str]:
+    """A sentence for every fitted scale of N_ERR that is so large that a misfit was taken for noise."""
+    for name, value in zip(result.model.names, result.values.tolist(), strict=True):
+        if name.startswith(COMMON) and value > thresholds.PART:
+            yield (
+                f"the errors are fitted as {value:.3g} times N_ERR ({name}): they take a misfit for noise; diagnose "
+                "the set with its errors as stated, and fit errors once nothing is missing"
+            )
 
 
 def candidate_scores(design: Design, seed: int = 0, singles: Singles | None = None) -> ScoreTable:
