@@ -138,31 +138,31 @@ def test_a_pattern_without_a_name_competes_with_names():
     assert [thing.is_pattern for thing in posterior.things] == [True]
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_two_names_come_before_a_pattern_that_holds_both(seed):
-    """The pattern explains most as one thing, and neither name is of use beside it; it has four numbers too many."""
-    a, b, *others = (v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((6, ROWS)))
+def both_in(wide, further, seed):
+    """Evidence of two effects of opposite sign, whose columns are the first two of a candidate with `further` ones."""
+    a, b, *others = (
+        v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((2 + further, ROWS))
+    )
     columns = {
         "clp_zero": a[:, None],
         "rotator_zero": b[:, None],
-        "a pattern": np.stack([a, b, *others], axis=1),
+        wide: np.stack([a, b, *others], axis=1),
     }
     found, *_ = scene({"clp_zero": [25.0], "rotator_zero": [-25.0]}, 200 + seed, columns, 25.0)
-    things = most_probable(found).things
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_names_come_before_a_pattern_that_holds_both(seed):
+    """The pattern explains most as one thing, and neither name is of use beside it; it has four numbers too many."""
+    things = most_probable(both_in("a pattern", 4, seed)).things
     assert sorted(getattr(thing.candidate, "name", "") for thing in things) == ["clp_zero", "rotator_zero"]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_two_effects_come_before_a_description_that_holds_both(seed):
     """No exchange leads from the description to both; two amplitudes are more probable than four that do the same."""
-    a, b, *others = (v / np.linalg.norm(v) for v in np.random.default_rng(seed).standard_normal((4, ROWS)))
-    columns = {
-        "clp_zero": a[:, None],
-        "rotator_zero": b[:, None],
-        "turn of polariser": np.stack([a, b, *others], axis=1),
-        "gain of O1": others[0][:, None],
-    }
-    found, *_ = scene({"clp_zero": [25.0], "rotator_zero": [-25.0]}, 300 + seed, columns, 25.0)
+    found = both_in("turn of polariser", 2, seed)
     scores = JointScores(found)
     assert [scores.names[number] for number, _ in scores._grown([])] == ["turn of polariser"]
     assert sorted(t.candidate.name for t in most_probable(found).things) == ["clp_zero", "rotator_zero"]
@@ -172,8 +172,8 @@ def test_two_effects_come_before_a_description_that_holds_both(seed):
 def test_effects_asked_alone_have_the_evidence_that_they_have_among_all(members):
     scores = JointScores(scene({"clp_zero": [9.0]})[0])
     of = [(scores.names.index(name), 1.0) for name in members]
-    every, alone = scores.beside(of), scores.beside(of, effects_alone=True)
     effects = scores._is_effect
+    every, alone = scores.beside(of), scores.beside(of, effects)
     assert np.allclose(alone[effects], every[effects], rtol=1e-12, atol=1e-12)
     assert np.isneginf(alone[~effects]).all()
 

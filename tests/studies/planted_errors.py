@@ -184,7 +184,7 @@ ERRORS = (
             "jacobian.shape[0] - jacobian.shape[1]", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "- np.log1p(value)", "+ np.log1p(value)", "diagnosis/test_score.py"),
     planted("diagnosis/score.py", "t * s[..., None, :] ** 2", "s[..., None, :] ** 2", "diagnosis/test_score.py"),
-    planted("diagnosis/selection.py", "self.scores[places] - along[at] @ taken", "self.scores[places]",
+    planted("diagnosis/selection.py", "scores = self.scores - along @ taken", "scores = self.scores",
             "diagnosis/test_selection.py"),
     planted("diagnosis/selection.py", "(self._is_named, self._is_effect)", "(self._is_named,)",
             "diagnosis/test_selection.py"),

@@ -20,7 +20,7 @@ Search       Asked once the scores have raised the alarm: the first thing need o
              most probable candidate is added until something more is missing with a probability below λ. After
              each addition every member is taken out in turn, and the most probable candidate beside the others takes
              its place, until nothing changes; a member that is less probable than its absence goes. Searches that begin
-            with a part of the candidates (names; effects alone) find sets that no exchange of one member leads to.
+             with a part of the candidates (names; effects alone) find sets that no exchange of one member leads to.
 Who it is    The *set* of a thing, given the other things, is the shortest list of names that holds it with probability
              λ, by either of two priors: the one above, in which one description has a thousandth of the probability of
              a name, since there are thousands of them; and one in which all names and all descriptions are equally
@@ -148,12 +148,9 @@ class JointScores:
         effects = {name for name, probe in self.probes.items() if probe.effect is not Described}
         self._is_named = np.array([name in self.probes for name in self.names])
         self._is_effect = np.array([name in effects for name in self.names])
-        self._of_effects = np.concatenate(
-            [np.arange(self._places[n].start, self._places[n].stop) for n in np.flatnonzero(self._is_effect)]
-            or [np.zeros(0, int)]
-        )
         self._products: dict[int, AnyMatrix] = {}
-        self._known: dict[tuple[frozenset[SetMember], bool], Float[np.ndarray, "n t"]] = {}
+        self._sizes = sizes
+        self._known: dict[tuple[frozenset[SetMember], bytes], Float[np.ndarray, "n t"]] = {}
 
     def _block(
         self, chosen: Int[np.ndarray, " n"], size: int, grams: Sequence[AnyMatrix]
@@ -174,34 +171,33 @@ class JointScores:
     # --------------------------------------------------------------------------------------------- evidence
 
     def beside(
-        self, members: Sequence[SetMember], *, effects_alone: bool = False
+        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None = None
     ) -> Float[np.ndarray, "n t"]:
         """ln B of every candidate at each scale of its prior, in a model with `members`; −∞ where it has none.
 
-        With `effects_alone` no other candidates are asked, and have −∞: they are few, and that takes no time.
+        Only candidates that are `allowed` are asked (None: all); the others have −∞.
 
         With the products G and scores s of a candidate in prior widths, beside the members, and the scale t
 
             ln B = ½ t² sᵀ (1 + t² G)⁻¹ s − ½ ln det(1 + t² G)
         """
-        asked = frozenset(members), effects_alone
+        asked = frozenset(members), b"" if allowed is None else allowed.tobytes()
         if asked not in self._known:  # an exchange asks for the same few sets again and again
-            self._known[asked] = self._evidence_beside(members, self._of_effects if effects_alone else None)
+            self._known[asked] = self._evidence_beside(members, allowed)
         return self._known[asked]
 
     def _evidence_beside(
-        self, members: Sequence[SetMember], rows: Int[np.ndarray, " r"] | None
+        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None
     ) -> Float[np.ndarray, "n t"]:
-        """`rows` are the amplitudes of the candidates that are asked, in their order; None: of all."""
-        along, taken = self._taken_up(members, rows)
+        along, taken = self._taken_up(members, allowed)
+        scores = self.scores - along @ taken
         found = np.full((len(self.names), len(SCALES)), -np.inf)
         for chosen, at, gram in self._blocks:
-            if rows is not None:
-                some = self._is_effect[chosen]
-                chosen, gram, at = chosen[some], gram[some], np.searchsorted(rows, at[some])
+            if allowed is not None:
+                some = allowed[chosen]
+                chosen, at, gram = chosen[some], at[some], gram[some]
             size = at.shape[1]
-            places = at if rows is None else rows[at]
-            left, s = gram - along[at] @ along[at].swapaxes(1, 2), self.scores[places] - along[at] @ taken
+            left, s = gram - along[at] @ along[at].swapaxes(1, 2), scores[at]
             # Below the root of 1 + t² G that of a matrix with t s for its last row has the part of s that is explained.
             whole, inside = (
                 np.empty((len(chosen), size + 1, size + 1)),
@@ -215,18 +211,18 @@ class JointScores:
                 root, pull = below[inside], below[:, size, :size]
                 log_root = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
                 found[chosen, column] = 0.5 * np.sum(pull**2, axis=1) - log_root
-                if (one_sided := self.one_sided[places]).any():
+                if (one_sided := self.one_sided[at]).any():
                     inverse = np.linalg.inv(root)
                     covariance = t**2 * inverse.swapaxes(1, 2) @ inverse
                     found[chosen, column] += _on_its_side(one_sided, covariance, s)
         return found
 
     def _taken_up(
-        self, members: Sequence[SetMember], rows: Int[np.ndarray, " r"] | None
+        self, members: Sequence[SetMember], allowed: Bool[np.ndarray, " n"] | None
     ) -> tuple[Float[np.ndarray, "a m"], AnyVector]:
-        """The part of all columns (or of `rows` of them), and of the scores, that `members` explain."""
+        """The part of all columns, and of the scores, that `members` explain; 0 for candidates that are not allowed."""
         if not members:
-            return np.zeros((len(self.widths if rows is None else rows), 0)), np.zeros(0)
+            return np.zeros((len(self.widths), 0)), np.zeros(0)
         places = [self._places[number] for number, _ in members]
         at = np.concatenate([np.arange(place.start, place.stop) for place in places])
         scale = np.concatenate(
@@ -235,12 +231,17 @@ class JointScores:
         of_members = [self._products_with(number) for number, _ in members]
         own = np.concatenate([products[at] for products in of_members], axis=1) * scale
         root = np.linalg.cholesky(own * scale[:, None] + np.eye(len(at)))
-        if rows is not None:
-            of_members = [products[rows] for products in of_members]
         # ½ a m² multiplications each, where a general solution takes four times as many.
         solve = functools.partial(linalg.solve_triangular, root, lower=True, check_finite=False)
-        products = np.concatenate([one.T for one in of_members], axis=0) * scale[:, None]
-        return solve(products, overwrite_b=True).T, solve(scale * self.scores[at])
+        taken = solve(scale * self.scores[at])
+        rows = slice(None) if allowed is None else np.repeat(allowed, self._sizes)
+        products = np.concatenate([one[rows].T for one in of_members], axis=0) * scale[:, None]
+        along = solve(products, overwrite_b=True).T
+        if allowed is None:
+            return along, taken
+        of_all = np.zeros((len(self.widths), len(at)))
+        of_all[rows] = along
+        return of_all, taken
 
     def over_scales(self, found: Float[np.ndarray, "n t"]) -> AnyVector:
         """ln B of every candidate, averaged over the scales."""
@@ -296,11 +297,9 @@ class JointScores:
 
         Candidates are those `allowed`; None: all.
         """
-        found = self.beside(members, effects_alone=allowed is self._is_effect)
+        found = self.beside(members, allowed)
         worth = self.over_scales(found) + self.log_prior
         worth[[number for number, _ in members]] = -np.inf
-        if allowed is not None:
-            worth[~allowed] = -np.inf
         number = int(np.argmax(worth))
         scale = float(SCALES[np.argmax(found[number])])
         return (number, scale), float(worth[number]), _log_sum(worth)
