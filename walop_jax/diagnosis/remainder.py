@@ -271,11 +271,8 @@ def rival_conditions(design: Design, conditions: Singles, chi2: float) -> Iterat
     square = float(np.sum(design.projector(design.residual) ** 2))
     least = special.chdtri(1, local_p(thresholds.ALARM, len(scored)))
     gains = [float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) for item in scored]
-    likely = [
-        k
-        for k, gain in enumerate(gains)
-        if (square - gain) * errors < chi2 + 2.0 * thresholds.IMPROBABLE and gain > least
-    ]
+    most = chi2 + thresholds.CHI2_IMPROBABLE
+    likely = [k for k, gain in enumerate(gains) if (square - gain) * errors < most and gain > least]
     if likely:
         likely.sort(key=lambda k: -gains[k])
         shown = (scored[k] for k in likely[: thresholds.SHOWN])
@@ -348,10 +345,7 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
     added = after is not before
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
-    clear = conditions.clear
-    least_gain = clear[0].score.statistic - 2.0 * thresholds.IMPROBABLE if clear else 0.0
-    alike = [item for item in clear if item.score.statistic > least_gain]
-    for current in alike[:_FITTED]:
+    for current in conditions.alike[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
         for _ in range(_ROUNDS):  # Gauss–Newton steps: a clock wrong by hours is not in the linear range
             size += float(current.score.amplitudes[0])

@@ -50,7 +50,7 @@ def remedies(result: FitResult, is_noise: IsNoise) -> tuple[str, ...]:
     """
     found = [*_of_errors(result, is_noise), *_of_rows(result), *_of_numbers(result)]
     found.sort(key=lambda remedy: remedy.worth)
-    probable = (r for r in found if r.worth < found[0].worth + 2.0 * thresholds.IMPROBABLE)
+    probable = (r for r in found if r.worth < found[0].worth + thresholds.CHI2_IMPROBABLE)
     return tuple(remedy.sentence for remedy in probable)
 
 

@@ -151,6 +151,17 @@ class Singles:
         clear = (item for item in tried if corrected_p(item.score.log_p, len(tried)) < thresholds.ALARM)
         return sorted(clear, key=lambda item: item.score.log_p)
 
+    @property
+    def alike(self) -> list[Scored]:
+        """Those of the clear ones that explain as much as the clearest, or nearly: it is one of them."""
+        clear = self.clear
+        gains = [item.score.statistic - item.score.rank for item in clear]
+        return [
+            item
+            for item, gain in zip(clear, gains, strict=True)
+            if gain > gains[0] - thresholds.CHI2_IMPROBABLE
+        ]
+
 
 def _without_noise(design: Design, singles: Sequence[Single]) -> tuple[list[Single], list[Single]]:
     """Numbers that may be asked, and those whose column holds the noise of the data itself.
@@ -204,8 +215,7 @@ def stated_conditions(design: Design, singles: Singles | None = None) -> Iterato
     rest = square - best.statistic * singles.noise_scale**2
     if not result.explains_data and rest * result.noise_scale**2 > NEARLY * design.projector.free:
         return
-    least = best.statistic - best.rank - 2.0 * thresholds.IMPROBABLE
-    likely = [item for item in clear if item.score.statistic - item.score.rank > least]
+    likely = singles.alike
     # Of an element and one of its numbers alone, the shorter statement if it explains as much.
     likely = [item for item in likely if not any(_holds(item.score, rival.score) for rival in likely)]
     # A mistake of one number comes before one of sixteen.

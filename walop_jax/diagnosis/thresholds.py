@@ -48,6 +48,7 @@ EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
 # Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
 # class are averaged.
 IMPROBABLE = 6.9
+CHI2_IMPROBABLE = 2.0 * IMPROBABLE  # the same as a difference in χ²
 USEFUL = 2.0  # standard errors by which a term without a name must predict unseen settings better to be kept
 MOST_WIDTHS = PART  # prior widths by which an amplitude of an optical description, or a prior, may be off
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
