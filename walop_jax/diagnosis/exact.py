@@ -375,18 +375,24 @@ def other_descriptions(
     return trials, compared
 
 
-def _residuals_otherwise(design: Design, sentence: str) -> AnyVector:
-    """The residuals of a fit with the instrument described otherwise, at its values, by rows of data."""
-    model, values, calset = design.fit.model, design.fit.values, design.fit.calset
-    otherwise = None
-    if OtherDescription.name not in model.effect_names:
-        otherwise = model.rearranged(values, lambda bare: changed(bare, sentence))
-    if otherwise is None:
-        otherwise = described_otherwise(model, sentence, calset)
-    else:
-        values = otherwise.start
-    residual = Likelihood.of(calset, otherwise).residuals(values)[1]
-    return residual[design.measured.used].reshape(-1)
+def _residuals_otherwise(
+    likelihood: Likelihood, sentence: str, places: Sequence[Vector]
+) -> Iterator[AnyVector]:
+    """The residuals of a model with its instrument described otherwise, at values of its parameters, by rows of data.
+
+    Elements are arranged in place where they keep their parameters; else an effect arranges them, for all `places`.
+    """
+    model, calset, by_effect = likelihood.model, likelihood.calset, None
+    for values in places:
+        arranged = None
+        if OtherDescription.name not in model.effect_names:
+            arranged = model.rearranged(values, lambda bare: changed(bare, sentence))
+        if arranged is not None:
+            residual = Likelihood.of(calset, arranged).residuals(arranged.start)[1]
+        else:
+            by_effect = by_effect or Likelihood.of(calset, described_otherwise(model, sentence, calset))
+            residual = by_effect.residuals(values)[1]
+        yield residual[likelihood.used].reshape(-1)
 
 
 def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Choice, float, Vector]]:
@@ -400,21 +406,20 @@ def _screened(result: FitResult, sentences: Iterable[str]) -> Iterator[tuple[Cho
     for name in result.model.effect_names:
         start[result.model.positions(name)] = result.values[result.model.positions(name)]
     likelihood = Likelihood.of(calset, result.model)
-    fits = (dataclasses.replace(result, likelihood=likelihood, values=v) for v in (result.values, start))
-    places = list(map(Design.of, fits))
+    values = result.values, start
+    places = [Design.of(dataclasses.replace(result, likelihood=likelihood, values=v)) for v in values]
     reference = float(np.sum(places[0].projector(places[0].residual) ** 2))
     for sentence in sentences:
-        ratios = list[float]()
-        for design in places:
-            try:
-                residual = _residuals_otherwise(design, sentence)
-            except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
-                break
-            rows = design.residual.copy()
-            rows[: design.rows] = residual / design.fit.noise_scale
-            if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
-                break
-            ratios.append(float(np.sum(design.projector(rows) ** 2)) / reference)
+        ratios, otherwise = list[float](), _residuals_otherwise(likelihood, sentence, values)
+        try:
+            for design, residual in zip(places, otherwise, strict=True):
+                rows = design.residual.copy()
+                rows[: design.rows] = residual / design.fit.noise_scale
+                if np.abs(rows - design.residual).max() < NO_DIFFERENCE:
+                    break
+                ratios.append(float(np.sum(design.projector(rows) ** 2)) / reference)
+        except NoSuchPlaceError:  # it removes an element that an effect of the model acts on
+            continue
         if len(ratios) == len(places) and np.isfinite(ratios).any():
             best = int(np.nanargmin(np.where(np.isfinite(ratios), ratios, np.nan)))
-            yield Choice(sentence, ratios[best]), (1.0 - ratios[best]) * reference, places[best].fit.values
+            yield Choice(sentence, ratios[best]), (1.0 - ratios[best]) * reference, values[best]
