@@ -156,8 +156,7 @@ def _compared(
     # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
     of_data = [*of_some, *of_all]
     # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
-    far_off = left >= FAR_OFF
-    if not far_off:
+    if left < FAR_OFF:
         # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
         return look.first_of(
             [lambda: of_data, lambda: look.screen.in_parts(of_all)], min(look.enough, NEARLY)

@@ -63,14 +63,13 @@ class Refits:
 
         An instrument that is put together otherwise than that of `earlier` has candidates of its own.
         """
-        candidates, template = self.hypotheses, result.model.template
-        if any(effect.kind.is_structural() for effect in template.effects):
-            calset = result.calset
+        candidates, template, calset = self.hypotheses, result.model.template, result.calset
+        if structure := _structure(template):
             candidates = grammar.hypotheses(
                 candidates.effects, template, calset.exposures, len(calset.points)
             )
-            if earlier is not None and _structure(earlier.result.model.template) != _structure(template):
-                earlier = None
+        if earlier is not None and _structure(earlier.result.model.template) != structure:
+            earlier = None
         evidence = examine(result, candidates, self.rng, earlier)
         if evidence.alarm:
             self.tell(Stage(f"p = {evidence.table.p_global:.2g}: something is missing", "naming"))
