@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.data.records import Position
-from walop_jax.diagnosis import exact, refits, thresholds
+from walop_jax.diagnosis import exact, refits
 from walop_jax.diagnosis.design import Design, Measured, strata
 from walop_jax.diagnosis.examination import upper_limit
 from walop_jax.diagnosis.findings import Diagnosis
@@ -254,7 +254,7 @@ def slips():
 def test_patterns_that_hold_at_no_other_setting_do_not_predict_it(slips):
     """Errors of single settings are smooth over the field: they predict parts of it that they have not seen."""
     assert slips.fit.chi2 > 1.5 * slips.fit.dof
-    assert not refits.predicts_unseen(slips, vectors(slips), thresholds.USEFUL)
+    assert not refits.predicts_unseen(slips, vectors(slips))
 
 
 def gains(seed=3):
@@ -277,11 +277,11 @@ def test_a_term_is_useful_where_the_matrix_is_closer_to_the_truth_with_it(hidden
     assert off[1] < 0.5 * off[0] if hidden == "gains" else off[1] > 1.5 * off[0]
     design = Design.of(before)
     columns = [design.measured.candidate(one) for one in strata(design.measured) if one.block == "exposures"]
-    assert refits.predicts_unseen(design, columns, thresholds.USEFUL) == (hidden == "gains")
+    assert refits.predicts_unseen(design, columns) == (hidden == "gains")
 
 
 def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     hidden = Described.saying(["retardance u behind half1.plate * xy"], [0.02])
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
-    assert refits.predicts_unseen(optics, vectors(optics), thresholds.USEFUL)
+    assert refits.predicts_unseen(optics, vectors(optics))

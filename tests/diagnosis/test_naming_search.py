@@ -115,11 +115,12 @@ def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
 
 
 class Refusing(Counting):
-    """A judge by whose fits the name that is asked first does not predict held-out data."""
+    """A judge by whose fits the model is more probable without the name that is asked first."""
 
     def fitted(self, evidence, trial):
         fitted = super().fitted(evidence, trial)
-        return dataclasses.replace(fitted, leaves_noise=False, predicts=trial.effect.name != self.fits[0])
+        evidence = -1.0 if trial.effect.name == self.fits[0] else fitted.evidence
+        return dataclasses.replace(fitted, leaves_noise=False, evidence=evidence)
 
 
 def test_the_other_name_of_the_set_is_asked_once_the_most_probable_one_is_refused():

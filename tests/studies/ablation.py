@@ -72,11 +72,6 @@ def answers(args: tuple[Any, ...], answer: Any) -> bool:
     return bool(answer)
 
 
-def refuses(args: tuple[Any, ...], answer: Any) -> bool:
-    """True where the answer is no."""
-    return not answer
-
-
 def _of(text: str) -> Callable[[tuple[Any, ...], Any], bool]:
     """Refusals with a reason that begins so."""
     return lambda args, answer: answer.startswith(text)
@@ -84,8 +79,6 @@ def _of(text: str) -> Callable[[tuple[Any, ...], Any], bool]:
 
 REFUSED: tuple[Place, ...] = ((search, "against"),)
 RULES = (
-    Rule("a description predicts states and cells by its linear step, to be fitted (`_hopeful`)",
-         ((Refits, "_hopeful"),), always(True), refuses),
     Rule("data that were left out agree better with an addition",
          REFUSED,
          lambda real: lambda trial: real(dataclasses.replace(trial, compared=FitComparison())),
@@ -105,7 +98,7 @@ RULES = (
          ((remainder, "_needed"),), lambda _: lambda result, steps, judge: (result, steps),
          lambda args, answer: answer[0] is not args[0]),
     Rule("names that leave a poor fit poor are parts (`PART`)", ((remainder, "_parts"),), always({}), answers),
-    Rule("a free-form term for the remainder, where it predicts (`USEFUL`)",
+    Rule("a free-form term for the remainder, where it predicts unseen settings",
          ((remainder, "_with_free_form"),), lambda real: lambda *args: (real(*args)[0], None),
          lambda args, answer: answer[1] is not None),
     Rule("a model that predicts worse than the first is not adopted (`_worse`)",
@@ -160,7 +153,6 @@ SLOW: tuple[Place, ...] = (
     (workflow, "fit"), (workflow, "causes_of"), (refits, "examine"), (refits, "fit"), (refits, "try_effect"),
     (exact, "try_effect"), (refits, "other_descriptions"), (refits, "refit_without"), (refits, "before_and_after"),
     (remainder, "try_effect"), (remainder, "evidence_of_presence"), (remainder, "held_out"), (refits, "held_out"),
-    (Refits, "_hopeful"),
 )  # fmt: skip
 """Work that no rule is in: searches of one set do it once, up to where they part."""
 

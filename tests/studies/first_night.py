@@ -1,13 +1,14 @@
 """Gross mistakes of a first night: is the first sentence of a diagnosis the right one, and what does it cost?
 
-    python tests/studies/first_night.py [--only TEXT] [--further] [--seed 61] [--seconds 150]
+    python tests/studies/first_night.py [--only TEXT] [--further] [--seed 61] [--seconds 150] [--number POOR_FIT=2]
 
 Plates in, out, turned or exchanged; beams and cables exchanged; signs, zeros, orders and units of angles; in all
 exposures, in half of them or in one KIND only; two at once: forty, on WALOP-SOUTH, WALOP-NORTH, WALOP-LAB and CHARIS. A
 set of few field points is simulated for each, changed as the mistake changes it, and diagnosed. The first sentence is
 the reason with which the data are refused, or what the headline of the diagnosis says was found. Printed are, for each,
 whether that is right, CPU seconds, χ²/dof of the set as it stands and with the cause, and the sentence. All run in one
-process: the first mistakes of an instrument hold the compilation of the programs that later ones share.
+process: the first mistakes of an instrument hold the compilation of the programs that later ones share. With `--number`
+a number of `diagnosis.thresholds` has another value.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from changed_sets import block_of, with_block  # noqa: E402
 
 from walop_jax.data.records import CalibrationSet, FilterCurve, Position  # noqa: E402
+from walop_jax.diagnosis import thresholds  # noqa: E402
 from walop_jax.diagnosis.workflow import diagnose  # noqa: E402
 from walop_jax.fit.base_model import base_model  # noqa: E402
 from walop_jax.io.errors import DataError  # noqa: E402
@@ -468,8 +470,13 @@ def main() -> int:
     parser.add_argument("--further", action="store_true", help="others of South in place of the forty")
     parser.add_argument("--seed", type=int, default=61)
     parser.add_argument("--seconds", type=float, default=150, help="CPU s after which one is given up")
+    parser.add_argument("--number", default="", help="NAME=VALUE of a threshold")
     options = parser.parse_args()
     switch_on()
+    if options.number:
+        number, _, value = options.number.partition("=")
+        assert hasattr(thresholds, number), number
+        setattr(thresholds, number, float(value))
 
     def over(*_: object) -> None:
         raise OverError

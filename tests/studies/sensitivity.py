@@ -13,6 +13,7 @@ and those that are better and worse with the number as it is: right or in its cl
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections import Counter
 from pathlib import Path
@@ -34,7 +35,7 @@ from generate import STEP, Layout  # noqa: E402
 from judge import opened  # noqa: E402
 from study_options import options_of  # noqa: E402
 
-from walop_jax.diagnosis import thresholds  # noqa: E402
+from walop_jax.diagnosis import score, thresholds  # noqa: E402
 
 OTHERS = {
     "ALARM": (0.00135, 0.0054),
@@ -47,13 +48,15 @@ OTHERS = {
     "FLOOR": (1.1, 1.5),
 }
 """A smaller and a larger value of each."""
+REBUILT = {(score, "FAINTEST"): (0.01, 0.2), (thresholds, "COMMON_MODE"): (0.02, 0.1)}
+"""The same of numbers that are in the table of scores already: it is made again with each value."""
 
 
 class Scenes:
     """Scenes of a folder, and pairs, with the truth."""
 
     def __init__(self, folder: Path, seed: int, each: int, quiet: int, pairs: int) -> None:
-        self.blind = Layout(seed).blind
+        self.seed, self.blind = seed, Layout(seed).blind
         with np.load(folder / "scenes.npz") as scenes:
             self.residuals, self.without = scenes["residuals"], scenes["without"]
         self.blind.rng = np.random.default_rng([seed, 99])
@@ -107,10 +110,14 @@ def _outcome(verdict: Any, truth: dict[str, Any]) -> str:
     return "open" if verdict.kind == "unexplained" and not named else "wrong"
 
 
-def changed(scenes: Scenes, name: str, value: float) -> tuple[int, int, int]:
+def changed(
+    scenes: Scenes, name: str, value: float, module: Any = thresholds, *, rebuilt: bool = False
+) -> tuple[int, int, int]:
     """Scenes with another answer, better and worse ones with the number as it is."""
     counts = [0, 0, 0]
-    with patch.object(thresholds, name, value):
+    with patch.object(module, name, value), contextlib.ExitStack() as stack:
+        if rebuilt:
+            stack.enter_context(patch.object(scenes, "blind", Layout(scenes.seed).blind))
         for number, before in scenes.as_they_are.items():
             now = scenes.judged(number)
             gain = WORTH[before["outcome"]] - WORTH[now["outcome"]]
@@ -133,6 +140,10 @@ def main() -> None:
     for name, values in OTHERS.items():
         cells = [f"{value:g}: {'; '.join(map(str, changed(scenes, name, value)))}" for value in values]
         print(f"| `thresholds.{name}` | {cells[0]} | {cells[1]} |", flush=True)
+    for (module, name), values in REBUILT.items():
+        told = [changed(scenes, name, value, module, rebuilt=True) for value in values]
+        cells = [f"{value:g}: {'; '.join(map(str, of))}" for value, of in zip(values, told, strict=True)]
+        print(f"| `{module.__name__.rpartition('.')[2]}.{name}` | {cells[0]} | {cells[1]} |", flush=True)
 
 
 if __name__ == "__main__":

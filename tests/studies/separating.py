@@ -1,13 +1,14 @@
 """Are effects that a set cannot tell apart decided by the one or two exposures that are planned for them?
 
-    python tests/studies/separating.py [NAME ...] [--minutes 40] [--noises 3] [--diagnosed 0]
+    python tests/studies/separating.py [NAME ...] [--minutes 40] [--noises 3] [--diagnosed 0] [--instruments 1]
 
-For each scene a set is simulated with one effect. Its class is that effect and a rival, if a fit of the rival has a χ²
-that is larger by less than 9; with `--diagnosed 1` it is the class that a diagnosis of the set leaves. The exposures
-that separate its members are planned (`walop_jax/plans/separating.py`), simulated with the same instrument and effect
-and new noise, and joined with the set; every member is fitted to both. A class is decided when every rival has a χ²
-that is larger than that of the truth by more than 9. Printed are the exposures, and for each rival the Δχ² that was
-expected and those that were found.
+For each scene a set is simulated with one effect, on so many instruments as they may be built: with `--instruments 5`
+the six scenes are thirty classes, and take 50 minutes with one noise each. The class of a set is that effect and a
+rival, if a fit of the rival has a χ² that is larger by less than 9; with `--diagnosed 1` it is the class that a
+diagnosis of the set leaves. The exposures that separate its members are planned (`walop_jax/plans/separating.py`),
+simulated with the same instrument and effect and new noise, and joined with the set; every member is fitted to both. A
+class is decided when every rival has a χ² that is larger than that of the truth by more than 9. Printed are the
+exposures, and for each rival the Δχ² that was expected and those that were found.
 """
 
 from __future__ import annotations
@@ -78,11 +79,14 @@ def class_of_set(name: str, calset: CalibrationSet, diagnosed: bool) -> ClassOfR
     return ClassOfRun((truth, rival), (there, rival), calset, known)
 
 
-def scene(name: str, minutes: float, noises: int, diagnosed: bool) -> tuple[int, int] | None:
-    """Numbers of joined sets that decide the class of a scene, and of all; None without a class."""
+def scene(name: str, minutes: float, noises: int, diagnosed: bool, built: int) -> tuple[int, int, int] | None:
+    """Of a scene on the instrument that is drawn with the seed `built`: joined sets that decide its class, and all.
+
+    Third is the number of settings that are planned. None without a class.
+    """
     effect, begin = SCENES[name][0], time.process_time()
-    instrument = dataclasses.replace(walop.simulate(SOUTH, seed=1).truth, effects=())
-    first = walop.simulate(SOUTH, seed=101, instrument=instrument, effect=[effect]).calset
+    instrument = dataclasses.replace(walop.simulate(SOUTH, seed=built).truth, effects=())
+    first = walop.simulate(SOUTH, seed=100 + built, instrument=instrument, effect=[effect]).calset
     given = class_of_set(name, first, diagnosed)
     if given is None:
         return None
@@ -93,7 +97,7 @@ def scene(name: str, minutes: float, noises: int, diagnosed: bool) -> tuple[int,
     truth = effect.split("=")[0]
     if truth not in given.names:
         print(f"{name}: the truth is not in the class: {', '.join(given.names)}", flush=True)
-        return 0, noises
+        return 0, noises, 0
     decided, more = 0, {member: [] for member in given.names if member != truth}
     for seed in range(noises):
         second = walop.simulate(
@@ -107,22 +111,26 @@ def scene(name: str, minutes: float, noises: int, diagnosed: bool) -> tuple[int,
     for member, values in more.items():
         told = ", ".join(f"{value:.1f}" for value in values)
         print(f"{name}: {member}: Δχ² expected {expected[truth, member]:.1f}, found {told}", flush=True)
-    print(f"{name}: decided in {decided} of {noises}", flush=True)
-    return decided, noises
+    print(f"{name}: decided in {decided} of {noises}, by {len(planned.lines)} settings", flush=True)
+    return decided, noises, len(planned.lines)
 
 
 def main() -> None:
     """Print the study."""
-    parser = options_of(__doc__, minutes=40.0, noises=3, diagnosed=0)
+    parser = options_of(__doc__, minutes=40.0, noises=3, diagnosed=0, instruments=1)
     parser.add_argument("names", nargs="*", help=f"of: {'; '.join(SCENES)} (default: all)")
     given = parser.parse_args()
     results = [
-        scene(name, given.minutes, given.noises, bool(given.diagnosed)) for name in given.names or SCENES
+        scene(name, given.minutes, given.noises, bool(given.diagnosed), built)
+        for built in range(1, given.instruments + 1)
+        for name in given.names or SCENES
     ]
     classes = [result for result in results if result is not None]
+    in_two = sum(d == n and settings <= 2 for d, n, settings in classes)
     print(
-        f"{len(results)} scenes, {len(classes)} with a class; decided in {sum(d for d, _ in classes)} of "
-        f"{sum(n for _, n in classes)} joined sets, in all of them for {sum(d == n for d, n in classes)} classes"
+        f"{len(results)} scenes, {len(classes)} with a class; decided in {sum(d for d, _, _ in classes)} of "
+        f"{sum(n for _, n, _ in classes)} joined sets, in all of them for {sum(d == n for d, n, _ in classes)} "
+        f"classes, by at most two settings for {in_two}"
     )
 
 

@@ -41,6 +41,7 @@ from jaxtyping import Float
 from scipy import special
 
 from walop_jax.calibration.matrix import of_matrix
+from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import Classes, Shape, WeightedChanges
 from walop_jax.diagnosis.examination import Examination
@@ -58,7 +59,6 @@ from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.instrument import Instrument
 
-EXPECTED = 1.0  # number of undetected changes beforehand
 LEFT_OUT = 1e-3  # share of the undetected variance of the matrix that a product may lack
 DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in names) for names in CUBIC)
 
@@ -309,7 +309,7 @@ def _second_moments(blocks: Sequence[_Block], scatter: float) -> list[AnyMatrix]
 
 def _odds(groups: int) -> float:
     """ln of the prior odds of one of `groups` groups being there at one given scale, against its absence."""
-    prior = EXPECTED / max(groups, 2)
+    prior = thresholds.EXPECTED / max(groups, 2)
     return float(np.log(prior / (1.0 - prior) / len(SCALES)))
 
 

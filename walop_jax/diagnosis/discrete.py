@@ -207,7 +207,7 @@ def _stated_otherwise(likelihood: Likelihood, left: float, values: Vector) -> tu
         _, size, gain = screen.step(number, every)
         if gain > largest and abs(size) < stated.width:
             largest, best = gain, (number, size)
-    if best is None or largest < thresholds.GOOD_SHARE * screen.misfit:
+    if best is None or largest < thresholds.LIKELY_SHARE * screen.misfit:
         return ()
     found = screen.determined(best[0], every, best[1], "")
     found = _judged(found, likelihood.calset, likelihood.model, left, STEPS[1])

@@ -57,7 +57,6 @@ class Trial:
     alternatives     other shapes of the effect that explain the data as well, in words
     rivals, nameless  effects, and descriptions, that the addition may be instead
     probability      that it has this name and none of `rivals` and `nameless`
-    predicts         False if its linear step does not predict held-out data
     compared         the fits without and with it (`refits.before_and_after`)
     against          KINDs of exposures that contradict it
     refused          the reason for which it was not added; empty while nothing speaks against it
@@ -76,7 +75,6 @@ class Trial:
     alternatives: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
     nameless: tuple[str, ...] = ()
-    predicts: bool = True
     compared: FitComparison = dataclasses.field(default_factory=FitComparison)
     score: float = float("nan")
     p_value: float = float("nan")

@@ -25,7 +25,7 @@ from walop_jax.diagnosis.exact import (
 )
 from walop_jax.diagnosis.examination import Examination, examine, shortest
 from walop_jax.diagnosis.findings import Choice, FitComparison
-from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked, texts_of
+from walop_jax.diagnosis.hypotheses import Hypotheses, Ranked
 from walop_jax.diagnosis.score import Candidate
 from walop_jax.diagnosis.search import Reason, Round, State
 from walop_jax.fit.refit import FitResult, fit
@@ -88,8 +88,6 @@ class Refits:
         assert item is not None
         self.tell(f"trying {item.name}")
         if item.effect is Described:
-            if not self._hopeful(evidence, item):
-                return dataclasses.replace(trial, predicts=False)
             description = self._description(evidence, item)
             refitted = try_effect(evidence.result, description, len(evidence.descriptions), scale=item.scale)
         else:
@@ -115,16 +113,6 @@ class Refits:
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))
                 change, amplitude = times[best], -along[best] / square[best]
         return description if further else Described.saying([change.text], [float(amplitude)])
-
-    def _hopeful(self, evidence: Examination, item: Ranked) -> bool:
-        """True if the linear step of a description predicts held-out data.
-
-        Effects of the catalogue are not asked: their names support them.
-        """
-        single = any("exposure" in text for text in texts_of(item.probe))
-        candidate = evidence.candidate(item.probe.name)
-        column = [dataclasses.replace(candidate, widths=item.scale * candidate.widths)]
-        return predicts_unseen(evidence.design, column, thresholds.HOPEFUL, of_states=not single)
 
     def others(self, state: State) -> tuple[list[Trial], Mapping[str, Choice]]:
         """Trials of other descriptions of the instrument, and all that were compared.
@@ -296,18 +284,16 @@ def _structure(instrument: Instrument) -> list[tuple[str, Mapping[str, object]]]
     return [(e.name, e.choices()) for e in instrument.effects if e.kind.is_structural()]
 
 
-def predicts_unseen(
-    design: Design, terms: Sequence[Candidate], least: float, *, of_states: bool = True
-) -> bool:
+def predicts_unseen(design: Design, terms: Sequence[Candidate]) -> bool:
     """True if terms without a name predict states and parts of the field that they have not seen.
 
     Each unit of the data is left out in turn. One Gauss–Newton step of all parameters from the other data, with and
     without the terms, predicts the unit with the density ln p = −½ (dᵀΣ⁻¹d + ln det Σ), Σ = s² (1 + A H⁻¹ Aᵀ), which is
     broad where the other data do not determine it; s² is χ²/dof of the model, 1 or more. Units are cells of the field,
-    if there are several, and states: exposures that differ in nothing but the filter (left out if the terms are about
-    single exposures). The mean gain in ln p must exceed `least` standard errors for cells and for states: a term that
-    follows each setting of an element by itself predicts other places, but no other setting. The mean of dᵀd over the
-    states must not grow either: a term that bends the rest of the model may gain in ln p only by a broader density.
+    if there are several, and states: exposures that differ in nothing but the filter. The mean gain in ln p must be
+    `thresholds.SEPARATION` standard errors for cells and for states: a term that follows each setting of an element by
+    itself predicts other places, but no other setting. The mean of dᵀd over the states must not grow either: a term
+    that bends the rest of the model may gain in ln p only by a broader density.
 
     Symbols     d prediction error of the unit, A its rows of the Jacobian, H normal matrix of all others and priors
     """
@@ -318,12 +304,12 @@ def predicts_unseen(
     residual = np.append(design.residual, np.zeros(len(widths)))
     calset = design.fit.calset
     cells, state = field_cells(calset)[design.point], states(calset)[design.exposure]
-    units = [("cells", cells)] * (len(np.unique(cells)) > 1) + [("states", state)] * of_states
+    units = [("cells", cells)] * (len(np.unique(cells)) > 1) + [("states", state)]
     for kind, unit in units:
         before = _predictions(design.jacobian, design.residual, unit, design.projector.free)
         after = _predictions(rows, residual, unit, design.projector.free)
         gain, closer = after.density - before.density, after.distance - before.distance
-        if len(gain) < 2 or gain.mean() < least * gain.std(ddof=1) / np.sqrt(len(gain)):
+        if len(gain) < 2 or gain.mean() < thresholds.SEPARATION * gain.std(ddof=1) / np.sqrt(len(gain)):
             return False
         if kind == "states" and closer.mean() > 0.0:
             return False

@@ -58,7 +58,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
     columns = [first.evidence.candidate(name) for name in added]
-    if predicts_unseen(first.evidence.design, columns, thresholds.USEFUL):
+    if predicts_unseen(first.evidence.design, columns):
         return state, remainder
     state = _without(first, state, [Described.name], judge)
     remainder = dataclasses.replace(remainder, p_value=state.evidence.table.p_global)
@@ -165,7 +165,7 @@ def _with_free_form(state: State, judge: Refits) -> tuple[Unexplained, FitResult
     # A block has all patterns of its kind, and those that are not needed make errors larger as well.
     terms = {block: [measured.candidate(s) for s in strata(measured) if s.block == block] for block in blocks}
     design = evidence.design
-    useful = tuple(block for block in blocks if predicts_unseen(design, terms[block], thresholds.USEFUL))
+    useful = tuple(block for block in blocks if predicts_unseen(design, terms[block]))
     if not useful:
         return _and(remainder, _LEFT_OUT), None
     trial = try_effect(result, FreeForm.of(context_of(result), blocks=useful))
@@ -316,13 +316,13 @@ _WRONG = "a number that the set states is wrong"
 def number_alone(result: FitResult, conditions: Singles) -> str:
     """The number that a set states which, if it is wrong, turns the residuals of a fit into noise; empty: none.
 
-    Only numbers that explain more than `thresholds.GOOD_SHARE` of the misfit by a linear step are fitted.
+    Only numbers that explain more than `thresholds.LIKELY_SHARE` of the misfit by a linear step are fitted.
     """
     missing = (result.chi2 - result.dof) / result.noise_scale**2
     most = [
         item
         for item in conditions.testable
-        if float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) > thresholds.GOOD_SHARE * missing
+        if float(item.score.amplitudes[0]) ** 2 * float(item.rest[0]) > thresholds.LIKELY_SHARE * missing
     ]
     if not most:
         return ""

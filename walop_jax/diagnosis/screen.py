@@ -179,7 +179,7 @@ class Screen:
     def steps(self) -> list[Alternative]:
         """Numbers whose step in the run explains most of the misfit, each from the exposure on from which it does."""
         found = []
-        least = thresholds.GOOD_SHARE * self.misfit
+        least = thresholds.LIKELY_SHARE * self.misfit
         for number in stepping(self.likelihood):
             chosen, size, gain = self.step(number)
             if gain > least:

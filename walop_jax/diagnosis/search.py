@@ -118,8 +118,6 @@ def search(state: State, judge: TrialJudge) -> State:
 
 def against(trial: Trial) -> str:
     """Reason not to add the name of a trial; empty: there is none."""
-    if not trial.predicts:
-        return "by its linear step it does not predict settings and field points that it has not seen"
     if trial.fit is not None and not trial.fit.converged:
         return "its fit did not converge"
     if trial.evidence <= 0.0:
@@ -240,8 +238,8 @@ class _RoundInProgress:
 
     def explains(self, trial: Trial) -> bool:
         """Whether a trial explains so much that what has no linear step need not be asked."""
-        missing = self.evidence.chi2 - self.evidence.dof
-        return trial.leaves_noise or self.evidence.chi2 - trial.remaining > thresholds.GOOD_SHARE * missing
+        missing, left = (chi2 - self.evidence.dof for chi2 in (self.evidence.chi2, trial.remaining))
+        return trial.leaves_noise or left * thresholds.PART < missing
 
     def others(self, names: Sequence[Probable]) -> list[Probable]:
         """Trials of what has no linear step, once in a round; [] when asked again.

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from walop_jax.calibration.accuracy import GOAL
+
 # Is anything missing?
 
 SEPARATION = (
@@ -20,6 +22,7 @@ COMMON_MODE = 0.05  # rms (σ of one intensity) of disturbances that one camera 
 # What is missing, and which candidate it is (`selection`)?
 
 NOTHING_MORE = 0.5  # ν, probability beforehand that nothing more is missing
+EXPECTED = (1.0 - NOTHING_MORE) / NOTHING_MORE  # things that are missing beforehand, in the mean
 # λ, probability that something is missing from which on it is called, and with which a set of names holds its thing.
 CERTAIN = 0.95
 MOST_STEPS = 6  # things that are missing at once; additions of one diagnosis
@@ -33,15 +36,13 @@ LINEAR_GOOD = 1.0  # evidence by which members of a class that were fitted may d
 LINEAR = 0.01
 SAME = 0.999  # correlation of two columns from which on they are the same to the data
 POOR_FIT = 1.5  # χ²/dof above which structural effects and other descriptions are tried
-GOOD_SHARE = 0.5  # share of the misfit that a name must explain for these not to be tried
 FLOOR = math.sqrt(POOR_FIT)  # σ of residuals behind all candidates above which evidence counts in that unit
 
 # Additions
 
-# Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added; and
-# by which another reading of the data must, to be reported.
+# Factor by which names must bring down χ²/dof − 1 of a poor fit, else they are reported as parts, and not added, and
+# what has no linear step is tried beside them; and by which another reading of the data must, to be reported.
 PART = 10.0
-HOPEFUL = 1.0  # standard errors by which the linear step of a description must predict unseen settings better
 # Difference in evidence below which the better of two is not certain: odds of 19 to 1. More loss in ln p of the
 # exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
 EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
@@ -49,14 +50,16 @@ EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
 # class are averaged.
 IMPROBABLE = 6.9
 CHI2_IMPROBABLE = 2.0 * IMPROBABLE  # the same as a difference in χ²
-USEFUL = 2.0  # standard errors by which a term without a name must predict unseen settings better to be kept
 MOST_WIDTHS = PART  # prior widths by which an amplitude of an optical description, or a prior, may be off
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
 MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
 
 # Reports
 
-NEGLIGIBLE = 1e-4  # change of calibrated q and u that does not matter for an instrument good to 10⁻³
+NEGLIGIBLE = GOAL / PART  # change of calibrated q and u that does not matter for an instrument good to `GOAL`
+# Share of the variance of the noise below which it is a matter of the stated errors: by which residuals of one part of
+# the data may be larger or smaller than those of the rest, or that two exposures may have in common.
+UNEVEN = 0.25
 LARGEST_ROBUST_RATIO = 1.5  # of errors that allow for common disturbances of an exposure to those that do not
 SHOWN = 4  # alternatives that a sentence lists; files have all
 ROUNDING = 1e-9  # share below which a number is rounding
@@ -65,6 +68,7 @@ PROBABILITY = 0.99  # probability with which an effect at its detection limit is
 
 # Other descriptions of the instrument, other readings of the data
 
+LIKELY_SHARE = 0.5  # share of a misfit that a linear step of a number must explain for it to be fitted
 LEAST_GAIN = 12.0  # gain in χ² behind one linear step above which a description is worth a fit
 
 # Candidates and time

@@ -77,8 +77,6 @@ MADE_OF_N = (
 DRAWN_TOGETHER = 20  # draws that are projected together: copies of all, in double precision, were 300 MB
 DRAWS = 200  # of noise: a fifth of them give the number of trials to 16 %
 
-UNEVEN = 1.25
-"""Factor between the squared residuals of a group and those of all below which it is a matter of the stated errors."""
 NOISELESS = 1e-6
 """Squared residuals, beyond the reach of the parameters, of data that hold no noise: rounding, and second order."""
 
@@ -366,8 +364,8 @@ def _groups_of(design: Design) -> Mapping[str, Bool[np.ndarray, "1 e k"]]:
 def _groups(design: Design) -> Iterator[str]:
     scores = group_scores(design)
     # A part of the data so small that chance moves it by a quarter is held to a far smaller p by the number of groups.
-    limit = local_p(thresholds.ALARM, len(scores))
-    odd = [s for s in scores if s.p_value < limit and not 1.0 / UNEVEN < s.ratio < UNEVEN]
+    limit, most = local_p(thresholds.ALARM, len(scores)), 1.0 + thresholds.UNEVEN
+    odd = [s for s in scores if s.p_value < limit and not 1.0 / most < s.ratio < most]
     if odd:
         odd.sort(key=lambda s: -abs(np.log(max(s.ratio, 1e-12))))
         listed = some([f"{s.name} {s.ratio:.3g}" for s in odd], thresholds.SHOWN)

@@ -43,7 +43,6 @@ from walop_jax.model.instrument import Instrument
 
 STAR_POINTS = 16  # field points at which the errors of stars are computed
 MOST_HIDDEN = 12  # mistakes in a product: each costs a star one product of two vectors
-_FAINT = 0.5  # of the worst mistake, below which a measured effect is dropped
 
 
 class _Mistake(NamedTuple):
@@ -69,8 +68,8 @@ def undetected_errors(design: Design, singles: Singles) -> Hidden:
     """Single mistakes at the size detected with 99 % probability, and their consequences.
 
     Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
-    those that make q and u of stars most wrong, in the median over the field. An effect that data show below its usual
-    size does little to stars, which see what the polariser sees: it stays if it does half of what the worst does.
+    those that make q and u of stars most wrong, in the median over the field. Of those that the data measure,
+    `MOST_HIDDEN` stay.
     """
     fit = design.fit
     of_stars = _Starlight(design, singles.asked, usual_exposure(fit.calset, fit.model.template))
@@ -79,14 +78,14 @@ def undetected_errors(design: Design, singles: Singles) -> Hidden:
     changes = (fit.model.selection() @ design.projector.taken_up(along)).T
     turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
     errors = of_stars.errors(mistakes, changes) + 2.0 * LARGEST_P * turns
-    least, strong = _FAINT * errors.max(initial=0.0), np.linalg.norm(along, axis=0) > 1.0
+    strong = np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
         m = mistakes[i]
         acts = m.acts or bool(turns[i] > 0.0)
         # In the usual setting it is out of the beam; stars that are seen through it have it.
         elsewhere = not (acts or m.informed or m.effect is None) and bool(moves_with(m.effect, instrument))
-        if (errors[i] > least or not m.informed) if acts else (strong[i] or elsewhere):
+        if acts or strong[i] or elsewhere:
             best.setdefault(m.name, (i, acts, elsewhere))
     unseen = {i for i, acts, _ in best.values() if acts and not mistakes[i].informed}
     always = unseen | {i for i, _, elsewhere in best.values() if elsewhere}

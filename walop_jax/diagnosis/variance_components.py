@@ -59,8 +59,6 @@ from walop_jax.fit.verdict import STATED, Structure
 from walop_jax.io.text import some
 from walop_jax.sky.nights import night_of
 
-ALARM = 1e-3
-"""Probability that noise alone raises a doubt, all groupings together."""
 MOST_PLACES = 1000  # field points that are asked, spread over the set
 WITH_STRUCTURE = "N_ERR with structure of field points"
 
@@ -104,7 +102,7 @@ def variance_components(design: Design, *, structure_alone: bool = False) -> lis
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
     """Those that noise does not make, the clearest first, after one correction for all that were asked."""
-    limit = local_p(ALARM, len(components))
+    limit = local_p(thresholds.ALARM, len(components))
     return sorted((c for c in components if c.p_value < limit), key=lambda c: c.p_value)
 
 
@@ -306,10 +304,6 @@ def _blocks(
     return np.stack(found_d), stacked[..., : basis.shape[1]], stacked[..., basis.shape[1] :]
 
 
-LEAST = 0.25
-"""Correlation below which a common pattern of the optics cannot be separated from common noise."""
-
-
 def repeated_noise(design: Design) -> Iterator[str]:
     """Sentences on exposures that hold the same noise, by their number."""
     if pairs := pairs_alike(design):
@@ -351,6 +345,6 @@ def pairs_alike(design: Design) -> list[tuple[int, int, float]]:
     limit = -special.ndtri(local_p(thresholds.ALARM, len(first)))
     excess = 0.5 * (first_square / free[first] + second_square / free[second]) / shared[first, second] - 1.0
     pattern = correlation / np.maximum(1.0 - correlation, 1e-12)
-    alike = (deviate > limit) & (correlation > LEAST) & (excess < 0.5 * pattern)
+    alike = (deviate > limit) & (correlation > thresholds.UNEVEN) & (excess < 0.5 * pattern)
     pairs = zip(first[alike].tolist(), second[alike].tolist(), correlation[alike].tolist(), strict=True)
     return sorted(pairs, key=lambda pair: -pair[2])

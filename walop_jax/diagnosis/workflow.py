@@ -220,7 +220,7 @@ def _not_scored(
         if effect.is_structural():
             reasons[effect.name] = (
                 f"it has no amplitude and no score: it is tried where χ²/dof is above {thresholds.POOR_FIT:g} and no "
-                f"name explains {thresholds.GOOD_SHARE:g} of what is missing"
+                f"name explains all but 1/{thresholds.PART:g} of what is missing"
             )
         elif effect not in probed:
             reasons[effect.name] = "the exposures have nothing that it acts on"
