@@ -1,4 +1,4 @@
-"""Classes of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
+"""Questions of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
 
 import dataclasses
 import json
@@ -16,9 +16,9 @@ from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import (
-    Classes,
-    ClassMember,
-    ClassOf,
+    Member,
+    Question,
+    Questions,
     _with_ties,
     averaged,
     only_a_class,
@@ -113,7 +113,7 @@ def test_sentences_in_a_fixed_ratio_have_one_error(told):
 def test_a_class_of_one_changes_nothing(told):
     result, _ = told
     alone = Calibration.from_fit(result.with_verdict())
-    assert averaged(alone, Classes()) is alone
+    assert averaged(alone, Questions()) is alone
 
 
 def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
@@ -136,7 +136,7 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
     # What no member changes, the mean does not change: half-wave plates of thousands of µm, for example.
     alone = Calibration.from_fit(result.with_verdict())
-    product = averaged(alone, Classes(additions=(group,)))
+    product = averaged(alone, Questions(additions=(group,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     for name, value, of in zip(alone.model.names, alone.values, alone.model.parameters, strict=True):
         if not of.free and of.tie is None:
@@ -189,13 +189,11 @@ def test_members_that_say_a_name_in_other_words_move_its_parameter(turned):
     sums = (((1.0, Change.parsed(text)),),)
     none = np.zeros((len(fit.calset.points), 6))
     members = (
-        ClassMember("hwp2_axis", 0.0, sums, none, probability=0.5),
-        ClassMember(
-            text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5
-        ),
+        Member("hwp2_axis", 0.0, sums, none, probability=0.5),
+        Member(text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5),
     )
     alone = Calibration.from_fit(fit.with_verdict())
-    product = averaged(alone, Classes(additions=(ClassOf("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
+    product = averaged(alone, Questions(additions=(Question("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
     assert product.model.names == alone.model.names
     place = product.model.index("hwp2_axis.angle")
     assert product.values[place] == pytest.approx(0.5 * (a + b), rel=1e-12)
@@ -246,7 +244,7 @@ def test_the_mean_over_a_class_keeps_the_shape_of_a_spot(spotted, monkeypatch):
     result = spotted.result
     (spots,) = ambiguities(spotted, {"blemish": [RIVAL]}).additions
     assert spots.members[0].probability >= spots.members[1].probability
-    product = averaged(Calibration.from_fit(result.with_verdict()), Classes(additions=(spots,)))
+    product = averaged(Calibration.from_fit(result.with_verdict()), Questions(additions=(spots,)))
     values = dict(zip(product.model.names, product.values, strict=True))
     fitted = dict(zip(result.model.names, result.values, strict=True))
     for shape in ("blemish.x", "blemish.y", "blemish.size"):

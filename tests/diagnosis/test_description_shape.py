@@ -82,11 +82,13 @@ def test_a_deviation_changes_the_product_as_the_optics_do(described, text):
     """Error of the matrix beside the change of the matrix by a description of the same words."""
     state, classes = described
     result, shape, size = state.result, classes.shape, 1e-5
-    j = [change.text for change in shape.changes].index(text)
-    count = len(shape.changes)
+    (member,) = shape.members
+    j = [change.text for change in member.changes].index(text)
+    count = len(member.changes)
     covariance = np.zeros((count, count))
     covariance[j, j] = size**2
-    shape = shape._replace(moment=covariance, slopes=np.zeros_like(shape.slopes))
+    member = member._replace(covariance=covariance, slopes=np.zeros_like(member.slopes))
+    shape = shape._replace(members=(member,))
     alone = Calibration.from_fit(result.with_verdict())
     alone = dataclasses.replace(alone, covariance=np.zeros_like(alone.covariance), hidden=None)
     x, y = np.random.default_rng(2).uniform(-0.2, 0.2, (2, 20))
@@ -130,11 +132,11 @@ def test_a_hidden_deviation_is_in_the_errors():
     other = "retardance v behind collimator * y"
     calset = set_with(3, {TEXT: SIZE, other: -1.5e-3})
     one, both = fit_with(calset, TEXT), fit_with(calset, TEXT, other)
-    shape = ambiguities(examined_with(one), {TEXT: ()}).shape
-    j = [change.text for change in shape.changes].index(other)
+    (member,) = ambiguities(examined_with(one), {TEXT: ()}).shape.members
+    j = [change.text for change in member.changes].index(other)
     exact = both.values[both.model.index(f"described.{other.replace(' ', '_')}")]
     assert exact == pytest.approx(-1.5e-3, rel=0.3)
-    assert np.sqrt(shape.moment[j, j]) == pytest.approx(abs(exact), rel=0.25)
+    assert np.sqrt(member.covariance[j, j]) == pytest.approx(abs(exact), rel=0.25)
 
 
 def test_a_deviation_with_a_dependence_is_that_of_a_description():
@@ -202,7 +204,7 @@ def test_deviations_of_the_polariser_do_nothing_to_a_star():
     text = "retardance q of polariser * r2"
     state = examined_with(fit_with(set_with(3, {text: 4e-3}), text))
     classes = ambiguities(state, {text: ()})
-    assert classes.shape.on_stars == ()
+    assert classes.shape.members[0].acting == ()
     alone = classes._replace(additions=(), undetected=None)
     product = averaged(Calibration.from_fit(state.result.with_verdict()), alone)
     assert "deviations" not in product.model.effect_names
@@ -216,7 +218,7 @@ def test_deviations_of_sky_light_may_depend_on_the_temperature():
     calset = dataclasses.replace(calset, exposures=dataclasses.replace(calset.exposures, temp=kelvin))
     state = examined_with(fit_with(calset, text))
     classes = ambiguities(state, {text: ()})
-    laws = {change.beside_field for change in classes.shape.changes}
+    laws = {change.beside_field for change in classes.shape.members[0].changes}
     assert ("kelvin",) in laws
     product = averaged(Calibration.from_fit(state.result.with_verdict()), classes)
     (matrix, covariance), alone = product.matrix(0.1, 0.1), Calibration.from_fit(state.result.with_verdict())

@@ -339,7 +339,7 @@ def test_a_field_of_one_kind_may_as_well_begin_when_others_do():
     changed = dataclasses.replace(block, counts=counts)
     found = diagnose(dataclasses.replace(calset, intensities=TableIntensities.dense(calset.points, changed)))
     (addition,) = found.members.additions
-    names = {addition.added, *addition.names}
+    names = {addition.about, *addition.names}
     camera = truth.cameras.names[1]
     assert f"gain of {camera} * kind clp * smooth" in names
     assert any(name.startswith(f"gain of {camera} * hours ") for name in names)

@@ -10,7 +10,7 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import first_setting, planned_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep
-from walop_jax.diagnosis.class_product import Classes, averaged
+from walop_jax.diagnosis.class_product import Questions, averaged
 from walop_jax.diagnosis.discrepancy import (
     _Block,
     _carrying,
@@ -44,7 +44,7 @@ def sound():
 
 
 def product_of(result, shape) -> Calibration:
-    return averaged(Calibration.from_fit(result.with_verdict()), Classes(undetected=shape))
+    return averaged(Calibration.from_fit(result.with_verdict()), Questions(undetected=shape))
 
 
 def test_second_moments_are_those_of_the_mixture():

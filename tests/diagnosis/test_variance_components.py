@@ -90,7 +90,7 @@ def test_noise_raises_an_alarm_as_seldom_as_promised(design):
         p = np.array([question.answered(pull[:, i], square[i]).p_value for i in range(3000)])
         assert 0.3 < np.mean(p < 0.1) / 0.1 < 1.3, grouping.name
         smallest = np.minimum(smallest, p)
-    alarms = int(np.sum(smallest < 1.0 - (1.0 - thresholds.ALARM) ** (1.0 / len(asked_of))))
+    alarms = int(np.sum(smallest < 1.0 - (1.0 - thresholds.UNLIKELY) ** (1.0 / len(asked_of))))
     assert alarms <= 9  # 3 expected: more has a chance of 0.1 %
 
 
@@ -141,4 +141,4 @@ def test_parameters_know_of_the_structure_in_their_data(rough):
 def test_a_clean_fit_has_none():
     found = variance_components(Design.of(small_fit()))
     assert {one.grouping.name for one in found} >= {"field points", "field points in q and u", "exposures"}
-    assert all(one.p_value > thresholds.ALARM for one in found)
+    assert all(one.p_value > thresholds.UNLIKELY for one in found)

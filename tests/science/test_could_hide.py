@@ -22,7 +22,7 @@ from walop_jax.data.user_tables import read_input_table
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.diagnosis.trust import examined
-from walop_jax.diagnosis.undetected_errors import _Starlight, undetected_errors
+from walop_jax.diagnosis.undetected_errors import Starlight, undetected_errors
 from walop_jax.fit.refit import FitResult, refit
 from walop_jax.fit.verdict import Hidden
 from walop_jax.science.apply import apply
@@ -205,12 +205,11 @@ def test_what_an_effect_does_to_starlight_is_that_of_the_light_path(name):
     """From the responses, in the colour of the lamp, against the matrix of an instrument that has the effect."""
     fit = small_fit()
     design = Design.of(fit)
-    of_stars = _Starlight(design, Singles.of(design).asked, 0)
-    of_stars.places = np.arange(len(fit.calset.points))
+    of_stars = Starlight(design, Singles.of(design).asked, 0, np.arange(len(fit.calset.points)))
     (probe,) = [one for one in of_stars.asked if one.effect.name == name]
     count = len(probe.widths)
     none = np.zeros((design.projector.basis.shape[1], count))
-    for one in of_stars.effects(probe, 0.01 * probe.widths, none, np.ones(count, bool)):
+    for one in of_stars.mistakes(probe, 0.01 * probe.widths, none, np.ones(count, bool)):
         assert one.acts
         points = fit.calset.points
         at = of_stars.setting, fit.calset.filters, points.x, points.y

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from walop_jax.calibration.accuracy import Matrices
@@ -30,7 +29,6 @@ from walop_jax.likelihood.optics import linearised, plain_positions, through_ser
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import compiled, usual_threads
-from walop_jax.model.effects.base import Effect, with_amplitudes
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import values_of, with_values
@@ -43,8 +41,6 @@ if TYPE_CHECKING:
 
 Slopes = Float[np.ndarray, "p a 3 n"]  # in all parameters
 Filters = Mapping[str, FilterCurve]
-_MARK = 2.0**40
-"""A value that no parameter has: it finds the amplitudes of effects among all parameters."""
 
 
 def matrix_names(arms: int) -> tuple[str, ...]:
@@ -362,28 +358,6 @@ def of_structure(structure: Structure, values: Float[np.ndarray, "p m"]) -> Floa
         added[:, at, at] = 0.5 * structure.gain**2 * slope[:, :, None] * slope[:, None, :]
         added[:, at, at] += 0.5 * structure.response**2 * np.diag([0.0, 1.0, 1.0])
     return added
-
-
-def effect_slopes(
-    instrument: Instrument,
-    setting: Settings,
-    filters: Filters,
-    x: OfPoints,
-    y: OfPoints,
-    effects: tuple[Effect, ...],
-) -> Float[np.ndarray, "p a 3 e"]:
-    """Derivatives (point, arm, element, amplitude) of the matrix in the amplitudes of neutral effects, in their order.
-
-    They are 0 for parts of an effect that do not act on the matrix.
-    """
-    if not effects:
-        return np.zeros((len(x), len(instrument.cameras.pairs), 3, 0))
-    neutral, put = with_amplitudes(instrument, effects)
-    flat, to_tree = ravel_pytree(neutral)
-    marks = _MARK + np.arange(flat.size)
-    order = np.asarray(values_of(put(to_tree(jnp.asarray(marks)))))
-    at = [int(np.flatnonzero(order == mark)[0]) for mark in marks]
-    return matrix_slopes(put(neutral), setting, filters, x, y)[1][..., at]
 
 
 # ----------------------------------------------------------------------------------------- at the field points of a fit

@@ -1,16 +1,22 @@
-"""The product of a diagnosis: mean over the classes of its additions, with their spread in the covariance.
+"""The product of a diagnosis: the mean over everything that it leaves open, with the spread in the covariance.
 
-Equation     m̄ = Σ w_k m_k,   C = Σ w_k [C_k + (m_k − m̄)(m_k − m̄)ᵀ],   w_k = B_k / Σ B
-Symbols      m_k values in model k, of numbers that may be 0 in some of them; C_k their covariance; B_k evidence
+Questions    What is it that was added: which of the members of its class? How does it deviate from its description? Is
+             each change there that the data would not show? A question has members k with probabilities w_k; different
+             questions are taken as independent.
+Equation     m̄ = m + Σ_q (m̄_q − m),   C = C_m + Σ_q (C_q − C_m), with the law of total variance for each question:
+                 m̄_q = Σ_k w_k m_k,   C_q = Σ_k w_k [C_k + (m_k − m̄_q)(m_k − m̄_q)ᵀ]
+Symbols      m, C_m values and covariance of the fit; m_k values in model k, of numbers that may be 0 in some of them;
+             C_k their covariance. The w_k of a class are proportional to the evidence of its members.
 Source       Leamer 1978, Specification Searches, ch. 4; Hoeting et al. 1999, Stat. Sci. 14, 382 (law of total variance)
-Model        that of the fit with the descriptions of all members of all classes. An amplitude is 0 in the models of the
+Model        that of the fit with the changes of all members of all questions. An amplitude is 0 in the models of the
              others, so that values and covariance of the mixture are sufficient: the matrix, errors of stars and maps
-             follow as for any other calibration. Members with the same effect on the result count once.
-             Deviations from the shape of a description are the effect `deviations`, with their covariance.
+             follow as for any other calibration. Members with the same effect on the result count once. Deviations and
+             undetected changes are hundreds: those that act on starlight are the effect `deviations`. Their mean is
+             mostly noise; the product has the values of the fit, and their second moment E[c cᵀ] as covariance.
 Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
              only a class was identified and the product is not trusted: the ambiguity dominates the error. Likewise for
              the error of p from deviations.
-Limits       to first order; different additions are taken as independent.
+Limits       to first order.
 """
 
 from __future__ import annotations
@@ -44,76 +50,80 @@ def changes_in(sums: Sequence[WeightedChanges]) -> list[Change]:
     return [description for amplitude in sums for _, description in amplitude]
 
 
-class ClassMember(NamedTuple):
-    """One member of a class: its words, ln B against the model without what was added, its amplitudes in descriptions.
+class Member(NamedTuple):
+    """One answer to a question: its words, ln B against the model without what was added, its amplitudes in changes.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
     by its amplitudes, which have a `covariance`: empty for the addition itself, which the fit has. `change` is that of
-    the elements of the matrix at the field points.
+    the elements of the matrix at the field points. `acting` are the positions of the amplitudes that act on starlight
+    and are in the model of the product (None: all); the others only shift the parameters.
     """
 
     name: str
     evidence: float
     sums: tuple[WeightedChanges, ...]
-    change: Float[np.ndarray, "p m"]
+    change: Float[np.ndarray, "p m"] = np.zeros((0, 0))
     amplitudes: AnyVector = np.zeros(0)
     covariance: AnyMatrix = np.zeros((0, 0))
     values: AnyVector = np.zeros(0)
     slopes: AnyMatrix = np.zeros((0, 0))
-    probability: float = 0.0
+    probability: float = 1.0
+    acting: tuple[int, ...] | None = None
+
+    @property
+    def changes(self) -> list[Change]:
+        """All changes of its amplitudes."""
+        return changes_in(self.sums)
+
+    @property
+    def on_stars(self) -> tuple[WeightedChanges, ...]:
+        """Its amplitudes as the model of the product has them: nothing where they do not act on starlight."""
+        if self.acting is None:
+            return self.sums
+        return tuple(total if j in self.acting else () for j, total in enumerate(self.sums))
 
 
-class ClassOf(NamedTuple):
-    """An addition, and the members of its class, itself first.
+class Question(NamedTuple):
+    """What a diagnosis leaves open about one thing, and the possible answers.
 
-    Without an independent zero of the polariser `clp_zero` and `rotator_zero` are such a class: both turn the sky
-    against the polariser.
+    Without an independent zero of the polariser `clp_zero` and `rotator_zero` are the members of a class: both turn the
+    sky against the polariser. A retardance was described as growing with r², and the data would hardly show a part that
+    grows with r⁴: that question has one member, with this change, the value 0 and an error.
 
-    `at` are the positions of its amplitudes among the free parameters. `spread` is the error of p of stars between
-    members, `stated` that of the fit, medians over the field; `off` by how many errors of the product the farthest
-    member lies from it, in the median of the field, the worst element.
+    `about` is the addition of a class, which is its first member, with the positions `at` of its amplitudes among the
+    free parameters; of other questions it is in words. `spread` is the error of p of stars between members, `stated`
+    that of the fit, medians over the field; `off` by how many errors of the product the farthest member lies from it,
+    in the median of the field, the worst element. The changes of its members are in the effect `effect` of the product.
     """
 
-    added: str
+    about: str
     at: Int[np.ndarray, " a"]
-    members: tuple[ClassMember, ...]
+    members: tuple[Member, ...]
     spread: float
     stated: float
-    off: float
+    off: float = 0.0
+    effect: str = Described.name
+
+    @classmethod
+    def of_errors(cls, about: str, member: Member, spread: float, stated: float) -> Question:
+        """A question with one answer: changes that are in the errors of the product, and not in its values."""
+        return cls(about, np.zeros(0, int), (member,), spread, stated, 0.0, Deviations.name)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Members other than the addition itself."""
+        """Members of a class other than the addition itself."""
         return tuple(member.name for member in self.members[1:])
 
 
-class Shape(NamedTuple):
-    """Changes that are in the errors of a product and not in its values; errors of p of stars: from them, from the fit.
+class Questions(NamedTuple):
+    """All that a diagnosis leaves open: who its additions are, how they deviate from their descriptions, what hides.
 
-    A retardance was described as growing with r², and the data would hardly show a part that grows with r⁴: that part
-    is such a change, with the value 0 and an error.
-
-    `moment` is E[c cᵀ] of their amplitudes c, `slopes` the change of the free parameters of the fit by each. Those at
-    the positions `on_stars` act on starlight, and are in the product (`Deviations`).
+    `undetected` are changes that the data would not show.
     """
 
-    changes: tuple[Change, ...]
-    moment: AnyMatrix
-    slopes: AnyMatrix
-    on_stars: tuple[int, ...]
-    spread: float
-    stated: float
-
-
-class Classes(NamedTuple):
-    """Ambiguities of a diagnosis: classes of its additions that have other members, shapes of its descriptions.
-
-    `undetected` are changes that the data would not show: of those only the errors are in the product.
-    """
-
-    additions: tuple[ClassOf, ...] = ()
-    shape: Shape | None = None
-    undetected: Shape | None = None
+    additions: tuple[Question, ...] = ()
+    shape: Question | None = None
+    undetected: Question | None = None
 
     def __bool__(self) -> bool:
         return self.several or self.undetected is not None
@@ -124,23 +134,18 @@ class Classes(NamedTuple):
         return bool(self.additions) or self.shape is not None
 
     @property
-    def sums(self) -> list[WeightedChanges]:
-        """Amplitudes of all members beside the additions themselves."""
-        return [total for group in self.additions for member in group.members[1:] for total in member.sums]
-
-    @property
-    def shapes(self) -> tuple[Shape, ...]:
-        """Those that are in the product as `Deviations`."""
-        return tuple(shape for shape in (self.shape, self.undetected) if shape is not None)
+    def of_errors(self) -> tuple[Question, ...]:
+        """Those whose changes are in the errors of the product alone."""
+        return tuple(one for one in (self.shape, self.undetected) if one is not None)
 
     def averaged(self, calibration: Calibration) -> Calibration:
-        """The calibration of a fit as the mean over these classes (the function `averaged`)."""
+        """The calibration of a fit as the mean over the answers (the function `averaged`)."""
         return averaged(calibration, self)
 
     def deviations(self, model: Model, context: Context) -> Deviations | None:
-        """The effect that includes all that acts on stars, zero; None if nothing does."""
-        described = [] if self.shape is None else [self.shape.changes[j] for j in self.shape.on_stars]
-        changes = [shape.changes[j] for shape in self.shapes for j in shape.on_stars]
+        """The effect that includes all of `of_errors` that acts on stars, zero; None if nothing does."""
+        described = [] if self.shape is None else changes_in(self.shape.members[0].on_stars)
+        changes = [c for one in self.of_errors for member in one.members for c in changes_in(member.on_stars)]
         polariser = model.template.polariser
         # Ahead of the polariser no element may depend on exposures; its light may.
         ahead = None if polariser is None else ("ahead of", polariser.name)
@@ -157,25 +162,21 @@ def _place(change: Change) -> str:
     return " * ".join((f"{change.relation} {change.place}", *change.beside_field))
 
 
-def with_average(result: FitResult, classes: Classes) -> FitResult:
-    """The fit whose calibration is the mean over the classes of its additions, with all that may be undetected."""
-    return dataclasses.replace(result, alternatives=classes) if classes else result
+def with_average(result: FitResult, questions: Questions) -> FitResult:
+    """The fit whose calibration is the mean over what is open."""
+    return dataclasses.replace(result, alternatives=questions) if questions else result
 
 
-def averaged(calibration: Calibration, classes: Classes) -> Calibration:
-    """The calibration of a fit as the mean over the classes of its additions, with their spread in the covariance.
-
-    Its model includes all members, as descriptions, and deviations from the shapes of descriptions; different additions
-    are taken as independent.
-    """
-    if not classes:
+def averaged(calibration: Calibration, questions: Questions) -> Calibration:
+    """The calibration of a fit as the mean over the answers to some questions, their spread in the covariance."""
+    if not questions:
         return calibration
-    old, model = calibration.model, _holding(calibration, classes)
+    old, model = calibration.model, _holding(calibration, questions)
     said = _said_by_name(old)
     parts = [p.part for p in model.parameters]
     new = [i for i, name in enumerate(model.names) if name not in old.names and parts[i] != Deviations.name]
     if new:
-        model = _with_ties(model, new, _derivatives(model, Described.name, classes.sums, said))
+        model = _with_ties(model, new, _derivatives(model, Described.name, _of_additions(questions), said))
     place = np.array([model.index(name) for name in old.names])
     count, free = len(model.parameters), old.free
     start, fitted = np.zeros(count), np.zeros((count, count))
@@ -183,24 +184,29 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     fitted[np.ix_(place, place)] = calibration.covariance
     into = np.zeros((count, len(free)))
     into[place] = old.selection()
-    of_free = calibration.covariance[np.ix_(free, free)]
     values, covariance = start.copy(), fitted.copy()
-    for group in classes.additions:
-        conditional = into @ known_apart_from(of_free, group.at) @ into.T
-        means, errors = [start], [fitted]
-        for member in group.members[1:]:
-            amplitudes = _derivatives(model, Described.name, member.sums, said)
+    for question in (*questions.additions, *questions.of_errors):
+        # What was added is 0 in the models of other members; without an addition the parameters are as free as before.
+        conditional, means, errors = fitted, list[AnyVector](), list[AnyMatrix]()
+        if len(question.at):
+            of_free = calibration.covariance[np.ix_(free, free)]
+            conditional = into @ known_apart_from(of_free, question.at) @ into.T
+        for member in question.members:
+            if not len(member.amplitudes):  # the addition itself, which was fitted
+                means.append(start)
+                errors.append(fitted)
+                continue
+            amplitudes = _derivatives(
+                model, question.effect, member.on_stars, said if len(question.at) else None
+            )
             slopes = into @ member.slopes + amplitudes
-            means.append(start + into @ member.values + amplitudes @ member.amplitudes)
+            moved = into @ member.values if len(member.values) else 0.0
+            means.append(start + moved + amplitudes @ member.amplitudes)
             errors.append(conditional + slopes @ member.covariance @ slopes.T)
-        weights = np.array([member.probability for member in group.members])
-        mean, average = mixture(weights, np.stack(means), errors)
+        weights = np.array([member.probability for member in question.members])
+        mean, spread = mixture(weights, np.stack(means), errors)
         values += mean - start
-        covariance += average - fitted
-    for shape in classes.shapes:  # the model that was fitted remains: its parameters are as free as before
-        sums = [((1.0, c),) if j in shape.on_stars else () for j, c in enumerate(shape.changes)]
-        slopes = into @ shape.slopes + _derivatives(model, Deviations.name, sums)
-        covariance += slopes @ shape.moment @ slopes.T
+        covariance += spread - fitted
     # Held at their values: fits of other data would not constrain them.
     held = [
         dataclasses.replace(p, free=False, start=float(value)) if p.part == Deviations.name else p
@@ -217,13 +223,18 @@ def averaged(calibration: Calibration, classes: Classes) -> Calibration:
     )
 
 
-def _holding(calibration: Calibration, classes: Classes) -> Model:
-    """The model with the descriptions of all members that no effect of it says by a name, and with deviations."""
+def _of_additions(questions: Questions) -> list[WeightedChanges]:
+    """Amplitudes of all members of classes beside the additions themselves."""
+    return [total for one in questions.additions for member in one.members[1:] for total in member.sums]
+
+
+def _holding(calibration: Calibration, questions: Questions) -> Model:
+    """The model with the changes of all members of classes that no effect of it says by a name, and with deviations."""
     model = calibration.model
     said = _said_by_name(model)
-    texts = dict.fromkeys(s.text for s in changes_in(classes.sums) if s.text not in said)
+    texts = dict.fromkeys(s.text for s in changes_in(_of_additions(questions)) if s.text not in said)
     context = effect_context(model.template, calibration.exposures)
-    if (effect := classes.deviations(model, context)) is not None:
+    if (effect := questions.deviations(model, context)) is not None:
         model = with_effects(model, [effect], context)
     if not texts:
         return model
@@ -300,19 +311,19 @@ def _positive(matrix: AnyMatrix) -> AnyMatrix:
     return np.where(np.outer(scale > 0, scale > 0), 0.5 * (clipped + clipped.T), 0.0)
 
 
-def only_a_class(classes: Classes) -> Iterator[str]:
-    """A description on each class whose members differ by so much that nothing of it may be trusted, and on shapes."""
-    for group in classes.additions:
+def only_a_class(questions: Questions) -> Iterator[str]:
+    """A sentence on each class whose members differ by so much that nothing of it may be trusted, and on deviations."""
+    for group in questions.additions:
         if not (_dominates(group.spread, group.stated) or group.off > thresholds.SEPARATION):
             continue
         names = some([f"{m.name} ({100 * m.probability:.0f} %)" for m in group.members[1:]], thresholds.SHOWN)
         yield (
-            f"only a class of causes was named: {group.added} ({100 * group.members[0].probability:.0f} %) or {names}, "
+            f"only a class of causes was named: {group.about} ({100 * group.members[0].probability:.0f} %) or {names}, "
             f"with different effects on stars (p by {per_cent(group.spread)} %, median, where the "
             f"errors of the fit are {per_cent(group.stated)} %; elements of the matrix by up to "
             f"{two_digits(group.off)} errors): {_deciding(group)}"
         )
-    shape = classes.shape
+    shape = questions.shape
     if shape is not None and _dominates(shape.spread, shape.stated):
         yield (
             "the cause was described, not named: over the field, over the exposures and in its kind of polarisation it "
@@ -362,7 +373,7 @@ def _dominates(spread: float, stated: float) -> bool:
     return spread > min(GOAL, max(stated, thresholds.NEGLIGIBLE))
 
 
-def _deciding(group: ClassOf) -> str:
+def _deciding(group: Question) -> str:
     """Observations that would distinguish the members."""
     tests = [s.tested_by for member in group.members for total in member.sums for _, s in total[:1]]
     observations = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"

@@ -29,7 +29,6 @@ Limits      One effect at a time, to first order in its amplitude, for the shape
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -37,19 +36,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from walop_jax.calibration.accuracy import change_of_qu
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.could_hide import CouldHide, could_hide, hidden_errors
-from walop_jax.calibration.matrix import effect_slopes, first_setting, matrix_slopes
+from walop_jax.calibration.matrix import first_setting
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, examine, most_points, smallest
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
-from walop_jax.diagnosis.stated_conditions import STEP, Singles, condition_scores
+from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import sampled
-from walop_jax.diagnosis.undetected_errors import undetected_errors
+from walop_jax.diagnosis.undetected_errors import Starlight, undetected_errors
 from walop_jax.fit.refit import FitResult
 from walop_jax.fit.verdict import DATA, EFFECT
 from walop_jax.io.display import Display, Displayed
@@ -374,41 +372,20 @@ def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.nd
     It is at most the width of its prior: the plausible size where the detection limit is larger.
     Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
     """
-    design, result = examination.design, examination.result
-    instrument, calset = result.model.instrument(result.values), result.calset
-    setting = first_setting(calset, instrument)
-    x, y = calset.points.x, calset.points.y
-    matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
-    slopes = slopes @ result.model.selection()
-    chosen = _representative(columns)
-    changes, template = [np.zeros((*matrix.shape, 0))], result.model.template
-
-    def fringes(probe: Probe) -> bool:
-        terms = (change for member in probe.group for change in member.first_order(template))
-        return any(one.kind == "fringes" for change in terms for _, one in change)
-
-    # Fringes need more wavelength nodes than all others: they have a program of their own.
-    probes = sorted((p for p in examination.probes if p.name in chosen), key=fringes)
-    for _, subset in itertools.groupby(probes, fringes):
-        members = tuple(member for probe in subset for member in probe.group)
-        changes.append(effect_slopes(instrument, setting, calset.filters, x, y, members))
-    change = np.concatenate(changes, axis=-1)
-    starts = np.cumsum([0, *(len(probe.widths) for probe in probes)])
-    place = {probe.name: int(start) for probe, start in zip(probes, starts, strict=False)}
-    errors = np.full((len(columns), len(x)), np.nan)
+    design, calset, chosen = examination.design, examination.result.calset, _representative(columns)
+    errors = np.full((len(columns), len(calset.points)), np.nan)
     looked_at = [i for i, column in enumerate(columns) if column.probe.name in chosen]
     if not looked_at:
         return errors
-    raw = [
-        examination.candidates[c.probe.name].columns[:, c.number, None]
-        for c in (columns[i] for i in looked_at)
-    ]
-    along = design.products(raw, design.projector.basis).T
-    for i, taken_up in zip(looked_at, design.projector.taken_up(along).T, strict=True):
-        column = columns[i]
-        slope = change[..., place[column.probe.name] + column.number]
-        size = min(column.detected, float(column.probe.widths[column.number]))
-        errors[i] = change_of_qu(matrix, matrix + size * (slope - slopes @ taken_up))
+    of = [columns[i] for i in looked_at]
+    raw = [examination.candidates[c.probe.name].columns[:, c.number, None] for c in of]
+    taken_up = design.projector.taken_up(design.products(raw, design.projector.basis).T)
+    moved = examination.result.model.selection() @ taken_up
+    probes = {column.probe.name: column.probe for column in of}
+    stars = Starlight.everywhere(design, list(probes.values()))
+    sizes = np.array([min(c.detected, float(c.probe.widths[c.number])) for c in of])
+    changes = [stars.change(c.probe, c.number, size)[0] for c, size in zip(of, sizes.tolist(), strict=True)]
+    errors[looked_at] = stars.errors(changes, sizes[:, None] * moved.T)
     return errors
 
 
@@ -489,26 +466,18 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     tried = len(scored.testable)
     if not tried:
         return ()
-    result = design.fit
-    instrument, calset = result.model.instrument(result.values), result.calset
-    setting, x, y = first_setting(calset, instrument), calset.points.x, calset.points.y
-    matrix, slopes = matrix_slopes(instrument, setting, calset.filters, x, y)
     columns = np.column_stack([item.single.candidate.columns[:, 0] for item in scored.items])
     taken_up = design.projector.taken_up(design.projector.basis.T @ columns)
-    off = slopes @ (result.model.selection() @ taken_up)
+    moved = design.fit.model.selection() @ taken_up
+    stars = Starlight.everywhere(design, ())
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
     limits = []
     for number, item in enumerate(scored.items):
-        stated, slope = item.stated, off[..., number]
-        if stated.seen_by_stars:
-            step = STEP * stated.width
-            above, below = (
-                matrix_slopes(instrument, setting, stated.changed(h).filters, x, y)[0] for h in (step, -step)
-            )
-            slope = slope - (above - below) / (2.0 * step)
+        stated = item.stated
         # Of errors as stated, not of the residuals: a plan has none.
         detected = float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
         size = min(detected, stated.error)
-        error = over_field(change_of_qu(matrix, matrix + size * slope)[None])
+        slope = stars.slope_by_number(stated) if stated.seen_by_stars else 0.0
+        error = over_field(stars.errors([size * slope], size * moved[None, :, number]))
         limits.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
     return tuple(limits)

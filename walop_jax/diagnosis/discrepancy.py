@@ -43,7 +43,7 @@ from scipy import special
 from walop_jax.calibration.matrix import of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
-from walop_jax.diagnosis.class_product import Classes, Shape, WeightedChanges
+from walop_jax.diagnosis.class_product import Member, Question, Questions, WeightedChanges, mixture
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.hypotheses import Probe
@@ -65,16 +65,16 @@ DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in na
 
 def ambiguities(
     state: Examination, added: Mapping[str, Collection[str]], given: Collection[str] = ()
-) -> Classes:
-    """Classes of the additions to a model, shapes of its descriptions, and undetected changes.
+) -> Questions:
+    """Questions of the additions to a model, shapes of its descriptions, and undetected changes.
 
     `added` are effects and groups of descriptions, by name, each with the candidates that are reported as
     indistinguishable from it, `given` descriptions that the model had before (`class_members.classes_of`).
     """
     if not state.result.model.template.cameras.pairs:
-        return Classes()
+        return Questions()
     laid = LinearisedFit(state)
-    return Classes(
+    return Questions(
         additions=classes_of(laid, added, given),
         shape=shape_of(laid) if added else None,
         undetected=undetected(laid),
@@ -93,7 +93,7 @@ def _slopes(
 # ------------------------------------------------------------------------------ deviations from a description
 
 
-def shape_of(laid: LinearisedFit) -> Shape | None:
+def shape_of(laid: LinearisedFit) -> Question | None:
     """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
     if FreeForm.name in laid.fit.model.effect_names:  # it has every shape
         return None
@@ -103,10 +103,9 @@ def shape_of(laid: LinearisedFit) -> Shape | None:
     sums: tuple[WeightedChanges, ...] = tuple(((1.0, change),) for change in changes)
     step = laid.nothing_removed
     column = laid.design.stacked([laid.columns.of(sums)])
-    member = step.member("", sums, column, widths, 0.0)
-    moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
+    member = _of_second_moment(step.member("deviations", sums, column, widths, 0.0))
     slopes = _slopes(laid, sums, member.slopes)
-    between = slopes @ moment @ np.swapaxes(slopes, 1, 2)
+    between = slopes @ member.covariance @ np.swapaxes(slopes, 1, 2)
     # Terms that are zero in the usual setting act on stars at another temperature: look at the steady part.
     steady = [dataclasses.replace(change, factors=change.over_field) for change in changes]
     _, at_any = laid.added([((1.0, change),) for change in steady])
@@ -115,8 +114,20 @@ def shape_of(laid: LinearisedFit) -> Shape | None:
     on_stars = tuple(
         j for j, c in enumerate(changes) if acting[j] and c.applies_to_catalogue and c.beside_field in laws
     )
-    spread = laid.error_of_p(between)
-    return Shape(tuple(changes), moment, member.slopes, on_stars, spread, laid.stated)
+    member = member._replace(acting=on_stars)
+    return Question.of_errors("deviations from descriptions", member, laid.error_of_p(between), laid.stated)
+
+
+def _of_second_moment(member: Member) -> Member:
+    """The member with the mean 0 of its amplitudes c and E[c cᵀ] as their covariance: values are those of the fit."""
+    moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
+    count = len(member.values)
+    return member._replace(
+        amplitudes=np.zeros_like(member.amplitudes),
+        covariance=moment,
+        values=np.zeros(count),
+        change=np.zeros((0, 0)),
+    )
 
 
 _OPTICS = {name.partition(" ")[0] for name in GENERATORS} | {"turn"}
@@ -226,7 +237,7 @@ class _Block(NamedTuple):
     slopes: AnyMatrix
 
 
-def undetected(laid: LinearisedFit) -> Shape | None:
+def undetected(laid: LinearisedFit) -> Question | None:
     """Covariance of undetected changes, expressed by changes ahead of the train; None if there are no such changes."""
     if not (places := _steady_places(laid)):
         return None
@@ -252,8 +263,17 @@ def undetected(laid: LinearisedFit) -> Shape | None:
         return None
     covariance = loadings @ loadings.T
     between = slopes[..., chosen] @ covariance @ np.swapaxes(slopes[..., chosen], 1, 2)
-    acting, spread = tuple(ahead.sums[j][0][1] for j in chosen), laid.error_of_p(between)
-    return Shape(acting, covariance, ahead.slopes[:, chosen], tuple(range(len(chosen))), spread, laid.stated)
+    member = Member(
+        "undetected",
+        0.0,
+        tuple(ahead.sums[j] for j in chosen),
+        amplitudes=np.zeros(len(chosen)),
+        covariance=covariance,
+        slopes=ahead.slopes[:, chosen],
+    )
+    return Question.of_errors(
+        "changes that the data would not show", member, laid.error_of_p(between), laid.stated
+    )
 
 
 def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
@@ -316,13 +336,17 @@ def _odds(groups: int) -> float:
 def _second_moment(
     gram: AnyMatrix, scores: AnyVector, widths: AnyVector, odds: float, scatter: float
 ) -> AnyMatrix:
-    """E[c cᵀ] of the amplitudes of a group, over its scales and its absence."""
+    """E[c cᵀ] of the amplitudes of a group: the mixture over its scales and its absence, about 0."""
     value, vector = np.linalg.eigh(gram * np.outer(widths, widths))
     value, along = np.clip(value, 0.0, None), vector.T @ (scores * widths)
-    weight = special.softmax([*(odds + log_bayes_by_scale(value, along, SCALES) / scatter**2), 0.0])[:-1]
-    variance = SCALES**2 / (1.0 + np.outer(value, SCALES**2))  # amplitudes, scales
-    mean, vector = variance * along[:, None], widths[:, None] * vector
-    return vector @ (np.diag(variance @ weight) + (mean * weight) @ mean.T) @ vector.T
+    there = odds + log_bayes_by_scale(value, along, SCALES) / scatter**2
+    weights = special.softmax([*there, 0.0])
+    variance = SCALES[:, None] ** 2 / (1.0 + np.outer(SCALES**2, value))  # scale, amplitude
+    none = np.zeros((1, len(widths)))
+    means = np.concatenate([variance * along, none])
+    mean, covariance = mixture(weights, means, [np.diag(of) for of in np.concatenate([variance, none])])
+    vector = widths[:, None] * vector
+    return vector @ (covariance + np.outer(mean, mean)) @ vector.T
 
 
 def _of_other_light(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:

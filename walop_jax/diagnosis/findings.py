@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Classes, Shape
+from walop_jax.diagnosis.class_product import Question, Questions
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -316,7 +316,7 @@ class Diagnosis(Drawn):
     choices: tuple[Choice, ...] = ()
     classes: tuple[Mapping[str, Any], ...] = ()
     ended: str = ""
-    members: Classes = dataclasses.field(default_factory=Classes)
+    members: Questions = dataclasses.field(default_factory=Questions)
     rounds: tuple[Any, ...] = ()
     not_scored: Mapping[str, str] = dataclasses.field(default_factory=dict)
     descriptions: int = 0
@@ -622,7 +622,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "classes": diagnosis.classes,
         "members": [
             {
-                "added": addition.added,
+                "added": addition.about,
                 "members": [{"name": m.name, "probability": m.probability} for m in addition.members],
                 "spread_of_p": addition.spread,
                 "stated_error_of_p": addition.stated,
@@ -645,12 +645,12 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
     return plain(content)
 
 
-def _shape(shape: Shape | None) -> dict[str, Any] | None:
+def _shape(shape: Question | None) -> dict[str, Any] | None:
     """The entry of deviations that are in the product."""
     if shape is None:
         return None
     return {
-        "deviations": len(shape.changes),
+        "deviations": sum(len(member.sums) for member in shape.members),
         "spread_of_p": shape.spread,
         "stated_error_of_p": shape.stated,
     }

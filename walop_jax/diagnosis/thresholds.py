@@ -46,9 +46,10 @@ PART = 10.0
 # Difference in evidence below which the better of two is not certain: odds of 19 to 1. More loss in ln p of the
 # exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
 EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
-# Difference in evidence at which the other has a probability of 10⁻³: rivals are listed down to it, and members of a
-# class are averaged.
-IMPROBABLE = 6.9
+# Probability of what is not to be expected: with it noise raises a doubt about how residuals are grouped. Rivals are
+# listed, and members of a class averaged, down to the difference in evidence at which the other one is so probable.
+UNLIKELY = 1e-3
+IMPROBABLE = -math.log(UNLIKELY)
 CHI2_IMPROBABLE = 2.0 * IMPROBABLE  # the same as a difference in χ²
 MOST_WIDTHS = PART  # prior widths by which an amplitude of an optical description, or a prior, may be off
 MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked

@@ -20,14 +20,14 @@ Limits      One mistake at a time, one amplitude of an effect at a time, to firs
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
+from walop_jax.calibration.accuracy import LARGEST_P, Matrices, change_of_qu
 from walop_jax.calibration.could_hide import as_text, change_by_effect, moves_with, turn_of
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.data.records import CalibrationSet
@@ -35,10 +35,10 @@ from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import local_p, noncentrality
-from walop_jax.diagnosis.stated_conditions import Singles
+from walop_jax.diagnosis.stated_conditions import STEP, Singles, Stated
 from walop_jax.fit.verdict import DATA, EFFECT, Hidden, UndetectedError
 from walop_jax.likelihood.starlight import added_to_starlight
-from walop_jax.model.effects import Effect
+from walop_jax.model.effects import Change, Effect
 from walop_jax.model.instrument import Instrument
 
 STAR_POINTS = 16  # field points at which the errors of stars are computed
@@ -60,7 +60,7 @@ class _Mistake(NamedTuple):
     along: Float[np.ndarray, " q"]
     informed: bool
     effect: Effect | None = None
-    change: Float[np.ndarray, "p a 3"] | float = 0.0
+    change: Matrices | float = 0.0
     acts: bool = False
 
 
@@ -72,12 +72,13 @@ def undetected_errors(design: Design, singles: Singles) -> Hidden:
     `MOST_HIDDEN` stay.
     """
     fit = design.fit
-    of_stars = _Starlight(design, singles.asked, usual_exposure(fit.calset, fit.model.template))
+    places = np.unique(np.linspace(0, len(fit.calset.points) - 1, STAR_POINTS).astype(int))
+    of_stars = Starlight(design, singles.asked, usual_exposure(fit.calset, fit.model.template), places)
     instrument, mistakes = of_stars.instrument, list(_mistakes(singles, of_stars))
     along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.projector.taken_up(along)).T
     turns = np.array([0.0 if m.effect is None else abs(turn_of(instrument, m.effect)) for m in mistakes])
-    errors = of_stars.errors(mistakes, changes) + 2.0 * LARGEST_P * turns
+    errors = _medians(of_stars.errors([m.change for m in mistakes], changes)) + 2.0 * LARGEST_P * turns
     strong = np.linalg.norm(along, axis=0) > 1.0
     best: dict[str, tuple[int, bool, bool]] = {}
     for i in np.argsort(-errors, kind="stable").tolist():
@@ -100,7 +101,13 @@ def undetected_errors(design: Design, singles: Singles) -> Hidden:
     return Hidden(tuple(hidden), changes[order])
 
 
-def _mistakes(singles: Singles, of_stars: _Starlight) -> Iterator[_Mistake]:
+def _medians(errors: Float[np.ndarray, "c p"]) -> Float[np.ndarray, " c"]:
+    """Median over the places where q and u are measured; 0 where they are at none."""
+    measured = np.isfinite(errors).any(axis=0)
+    return np.median(errors[:, measured], axis=1) if measured.any() else np.zeros(len(errors))
+
+
+def _mistakes(singles: Singles, of_stars: Starlight) -> Iterator[_Mistake]:
     """All of them, amplitude by amplitude."""
     p, shown = local_p(thresholds.ALARM, len(singles.testable)), set[str]()
     for single, score, along, rest, alive in singles.items:
@@ -113,7 +120,7 @@ def _mistakes(singles: Singles, of_stars: _Starlight) -> Iterator[_Mistake]:
         along = along * sizes
         if single.probe is not None:
             shown.add(single.probe.name)
-            yield from of_stars.effects(single.probe, sizes, along, alive)
+            yield from of_stars.mistakes(single.probe, sizes, along, alive)
         else:
             kind, size = EFFECT if single.stated is None else DATA, float(sizes[0])
             number = score.name, kind, size, single.unit, single.shown_by
@@ -121,28 +128,57 @@ def _mistakes(singles: Singles, of_stars: _Starlight) -> Iterator[_Mistake]:
     for probe in (probe for probe in of_stars.asked if probe.name not in shown):
         count = len(probe.widths)
         nothing = np.zeros((of_stars.parameters, count))
-        yield from of_stars.effects(probe, probe.widths, nothing, np.zeros(count, bool))
+        yield from of_stars.mistakes(probe, probe.widths, nothing, np.zeros(count, bool))
 
 
-class _Starlight:
-    """Change of starlight by the effects that are asked, in the setting of an exposure."""
+class Starlight:
+    """What effects do to the light of a star in the setting of an exposure, and to its q and u once it is calibrated.
 
-    def __init__(self, design: Design, asked: Sequence[Probe], exposure: int) -> None:
-        self.fit, self.asked, self.parameters = design.fit, asked, design.projector.basis.shape[1]
+    `asked` are the effects, `places` the field points at which errors are asked.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        asked: Sequence[Probe],
+        exposure: int,
+        places: Int[np.ndarray, " p"],
+    ) -> None:
+        self.fit, self.asked, self.places = design.fit, asked, places
+        self.parameters = design.projector.basis.shape[1]
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
         self.setting = first_setting(calset, self.instrument, exposure)
-        self.places = np.unique(np.linspace(0, len(calset.points) - 1, STAR_POINTS).astype(int))
         every = {p.name: [change for m in p.group for change in m.first_order(template)] for p in self.asked}
         linear = {
-            name: terms for name, terms in every.items() if terms and all(map(design.columns.has, terms))
+            name: terms
+            for name, terms in every.items()
+            if terms and all(map(design.columns.has, terms)) and not any(map(_of_fringes, terms))
         }
         changes = list(itertools.chain(*linear.values()))
         self.vectors, added = added_to_starlight(design.columns, changes, exposure)
         ends = np.cumsum([len(terms) for terms in linear.values()])[:-1]
         self.added = dict(zip(linear, np.split(added, ends, axis=-1), strict=False))
 
-    def effects(
+    @classmethod
+    def everywhere(cls, design: Design, asked: Sequence[Probe]) -> Starlight:
+        """At all field points, in the usual setting."""
+        fit = design.fit
+        exposure = usual_exposure(fit.calset, fit.model.template)
+        return cls(design, asked, exposure, np.arange(len(fit.calset.points)))
+
+    def change(self, probe: Probe, number: int, size: float) -> tuple[Matrices, bool]:
+        """Change of the matrix (place, arm, 3) by one amplitude at its size, and whether starlight changes anywhere."""
+        points = self.fit.calset.points
+        if probe.name in self.added:
+            added = self.added[probe.name][..., number] * size
+            change = of_matrix(self.vectors, added, self.instrument.cameras.pairs)
+        else:  # an effect that users define has no slots; fringes need more wavelengths
+            at = self.setting, self.fit.calset.filters, points.x, points.y
+            added = change = change_by_effect(self.instrument, _at_size(probe, number, size), *at)
+        return change[self.places], bool(np.abs(added).max(initial=0.0) > thresholds.ROUNDING)
+
+    def mistakes(
         self,
         probe: Probe,
         sizes: Float[np.ndarray, " a"],
@@ -150,46 +186,56 @@ class _Starlight:
         alive: Bool[np.ndarray, " a"],
     ) -> Iterator[_Mistake]:
         """The amplitudes of a probe, each by itself."""
-        declared, fit = probe.effect.numbers(), self.fit
-        pairs, points = self.instrument.cameras.pairs, fit.calset.points
-        for number, (parameter, effect) in enumerate(_at_sizes(probe, sizes)):
-            if probe.name in self.added:
-                added = self.added[probe.name][..., number] * sizes[number]
-                change = of_matrix(self.vectors, added, pairs)
-            else:  # a user-defined effect has no slots
-                at = self.setting, fit.calset.filters, points.x, points.y
-                added = change = change_by_effect(self.instrument, effect, *at)
-            size, unit = float(sizes[number]), declared[parameter].unit
+        declared = probe.effect.numbers()
+        for number, (parameter, size) in enumerate(zip(probe.parameters, sizes.tolist(), strict=True)):
+            effect, unit = _at_size(probe, number, size), declared[parameter].unit
+            change, acts = self.change(probe, number, size)
             number_of = (f"{probe.effect.name}.{parameter}", EFFECT, size, unit, probe.effect.revealed_by)
-            acts = bool(np.abs(added).max(initial=0.0) > thresholds.ROUNDING)
-            informed, change = bool(alive[number]), change[self.places]
-            yield _Mistake(*number_of, along[:, number], informed, effect, change, acts)
+            yield _Mistake(*number_of, along[:, number], bool(alive[number]), effect, change, acts)
+
+    def slope_by_number(self, stated: Stated) -> Matrices:
+        """Derivative of the matrix by a number that a set states of itself, under which stars are seen as well."""
+        points, step = self.fit.calset.points, STEP * stated.width
+        above, below = (
+            matrix_slopes(self.instrument, self.setting, stated.changed(h).filters, points.x, points.y)[0]
+            for h in (step, -step)
+        )
+        return (above - below)[self.places] / (2.0 * step)
 
     def errors(
-        self, mistakes: Sequence[_Mistake], changes: Float[np.ndarray, "c n"]
-    ) -> Float[np.ndarray, " c"]:
-        """Median error of q and u over some field points from each mistake; 0 where these are not measured.
+        self, changes: Sequence[Matrices | float], moved: Float[np.ndarray, "c n"]
+    ) -> Float[np.ndarray, "c p"]:
+        """Error of q and u at the places from each change of the matrix, less what its parameters `moved` make up for.
 
-        `changes` are those of the parameters.
+        NaN where q and u are not measured.
         """
-        calset, errors = self.fit.calset, np.zeros(len(mistakes))
+        calset, errors = self.fit.calset, np.zeros((len(changes), len(self.places)))
         x, y = calset.points.x[self.places], calset.points.y[self.places]
         matrix, slopes = matrix_slopes(self.instrument, self.setting, calset.filters, x, y)
-        for i, (mistake, moved) in enumerate(zip(mistakes, changes, strict=True)):
-            error = change_of_qu(matrix, matrix + (mistake.change - slopes @ moved))
-            errors[i] = np.median(error[np.isfinite(error)]) if np.isfinite(error).any() else 0.0
+        for i, (change, by) in enumerate(zip(changes, moved, strict=True)):
+            errors[i] = change_of_qu(matrix, matrix + (change - slopes @ by))
         return errors
 
 
-def _at_sizes(probe: Probe, sizes: Float[np.ndarray, " a"]) -> Iterator[tuple[str, Effect]]:
-    """Each amplitude of a probe by itself: its parameter, and the effect with it at its size."""
-    remaining = iter(sizes)
-    for member, name in itertools.product(probe.group, probe.effect.amplitudes()):
-        neutral = np.asarray(getattr(member, name), float)
-        for at in np.ndindex(neutral.shape):
-            value = neutral.copy()
-            value[at] += next(remaining)
-            yield name, member.replaced(**{name: jnp.asarray(value)})
+def _of_fringes(terms: Iterable[tuple[float, Change]]) -> bool:
+    return any(change.kind == "fringes" for _, change in terms)
+
+
+def _at_size(probe: Probe, number: int, size: float) -> Effect:
+    """One amplitude of a probe by itself, at its size."""
+    step = np.zeros(len(probe.widths))
+    step[number] = size
+    remaining = iter(step.tolist())
+    for member in probe.group:
+        moved = dict[str, Any]()
+        for name in probe.effect.amplitudes():
+            neutral = np.asarray(getattr(member, name), float)
+            by = np.reshape([next(remaining) for _ in range(neutral.size)], neutral.shape)
+            if by.any():
+                moved[name] = jnp.asarray(neutral + by)
+        if moved:
+            return member.replaced(**moved)
+    return probe.group[0]
 
 
 def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:

@@ -102,7 +102,7 @@ def variance_components(design: Design, *, structure_alone: bool = False) -> lis
 
 def found_components(components: list[VarianceComponent]) -> list[VarianceComponent]:
     """Those that noise does not make, the clearest first, after one correction for all that were asked."""
-    limit = local_p(thresholds.ALARM, len(components))
+    limit = local_p(thresholds.UNLIKELY, len(components))
     return sorted((c for c in components if c.p_value < limit), key=lambda c: c.p_value)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from walop_jax.data.joined_cells import joined_cells
 from walop_jax.data.records import CalibrationSet
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Classes, only_a_class, with_average
+from walop_jax.diagnosis.class_product import Questions, only_a_class, with_average
 from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.discrete import causes_before_a_fit, causes_of, refusal
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
@@ -171,7 +171,7 @@ def diagnose(
     return _examined(diagnosis, tables, rivals, seed)
 
 
-def _members(first: State, state: State, steps: Sequence[Step]) -> Classes:
+def _members(first: State, state: State, steps: Sequence[Step]) -> Questions:
     """Candidates that the data cannot distinguish from the additions, and their effect on stars."""
     alike = dict[str, Collection[str]]()
     # A single group has the rivals of the final model as well; of several groups these are rivals of all together.

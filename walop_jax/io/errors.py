@@ -16,7 +16,7 @@ PathLike = str | os.PathLike[str]
 _SHOWN = 5
 """Number of rows or names that a message spells out before it only counts the rest."""
 _ALIKE, _SHORT = 0.75, 3
-"""ClassMember of a name that is misspelt; letters of a word that says nothing by itself."""
+"""Likeness of a name that is misspelt; letters of a word that says nothing by itself."""
 
 
 class DataError(ValueError):
