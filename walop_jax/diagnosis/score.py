@@ -306,6 +306,10 @@ class ScoreSpace:
     def _root(self) -> _Root:
         return _Root(self.gram, self.alive)
 
+    def independent(self) -> tuple[Int[np.ndarray, " r"], Float[np.ndarray, "r r"]]:
+        """Columns that span those of all candidates, and the L of their Gram matrix G = L Lᵀ (lower triangle)."""
+        return self._root.chosen, self._root.first
+
     def forget(self) -> None:
         """Give back the memory of the root of the Gram matrix, which nothing but `table` and `smallest_p` asks for."""
         vars(self).pop("_root", None)
@@ -512,6 +516,7 @@ class Blocks:
 class _Root:
     """L of a Gram matrix G = L Lᵀ (`whole`) of some `rank`: Cholesky's method, the column with most left coming next.
 
+    `chosen` are the columns that span all others, in that order, and `first` is the L of these, in double precision.
     Rows and columns that are not `alive` are 0. Columns of which less than `ROOT_TOLERANCE` of their square is left
     behind those before them add nothing. Seven digits of L are plenty for draws.
     Source: Higham 1990, in Reliable Numerical Computation (Oxford), 161; LAPACK dpstrf.
@@ -521,6 +526,7 @@ class _Root:
         norm = np.sqrt(np.where(alive, np.clip(gram.diagonal(), 0.0, None), 0.0))
         every = np.flatnonzero(norm)
         self.whole, self.rank = np.zeros((len(norm), 0), np.float32), 0
+        self.chosen, self.first = np.zeros(0, int), np.zeros((0, 0))
         if not len(every):
             return
         # Of columns that are multiples of one another the first: the others add nothing.
@@ -536,10 +542,10 @@ class _Root:
             scaled, tol=ROOT_TOLERANCE, overwrite_a=True
         )
         order = nonzero[pivots - 1]
-        self._chosen, beyond = order[: self.rank], order[self.rank :]
-        self._first = np.triu(factor[: self.rank, : self.rank]).T * norm[self._chosen, None]
+        self.chosen, beyond = order[: self.rank], order[self.rank :]
+        self.first = np.triu(factor[: self.rank, : self.rank]).T * norm[self.chosen, None]
         root = np.empty((len(nonzero), self.rank), np.float32)
-        root[pivots[: self.rank] - 1] = self._first
+        root[pivots[: self.rank] - 1] = self.first
         for first in range(0, len(beyond), limits.COLUMNS_TOGETHER):
             at = slice(first, first + limits.COLUMNS_TOGETHER)
             part = factor[: self.rank, self.rank :][:, at].T * norm[beyond[at], None]
@@ -558,7 +564,7 @@ class _Root:
         """sᵀ G⁺ s of the scores s = Cᵀr: the square of the part of r in the span of the columns C."""
         if not self.rank:
             return 0.0
-        solution = linalg.solve_triangular(self._first, scores[self._chosen], lower=True)
+        solution = linalg.solve_triangular(self.first, scores[self.chosen], lower=True)
         return float(solution @ solution)
 
 

@@ -31,6 +31,7 @@ from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_cho
 from walop_jax.diagnosis.examination import Examination, most_points
 from walop_jax.diagnosis.findings import Diagnosis, DiagnosisVerdict, Step, describe, descriptions_of
 from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.held_errors import with_errors_free, with_errors_held
 from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.remainder import (
@@ -97,7 +98,16 @@ def diagnose(
     left, causes = (np.nan, ()) if as_written else causes_before_a_fit(sample, model, structural, tell)
     if causes and causes[0].of_data and causes[0].explained < NEARLY:
         raise refusal(left, causes)
-    before = fit(Likelihood.of(sample, model))
+    judge = Refits(
+        hypotheses=candidates,
+        rng=np.random.default_rng(seed),
+        tell=tell,
+        minutes=np.inf if minutes is None else minutes,
+        began=began,
+    )
+    quiet = dataclasses.replace(judge, tell=lambda text: None)
+    held = with_errors_held(Likelihood.of(sample, model), quiet.examined)
+    before = fit(Likelihood.of(sample, held))
     far_off = before.noise_scale > 1.0
     if causes is None or not (far_off or any(cause.number for cause in causes)):
         causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
@@ -105,14 +115,8 @@ def diagnose(
     left = before.chi2 / max(before.dof, 1)
     if causes and causes[0].of_data and (far_off or causes[0].explained < NEARLY):
         raise refusal(left, causes)
-    judge = Refits(
-        hypotheses=candidates,
-        rng=np.random.default_rng(seed),
-        tell=tell,
-        minutes=np.inf if minutes is None else minutes,
-        began=began,
-        most=thresholds.MOST_FITS_FAR_OFF if far_off else thresholds.MOST_FITS,
-    )
+    if far_off:
+        judge = dataclasses.replace(judge, most=thresholds.MOST_FITS_FAR_OFF)
     tell(Stage("scoring every effect and pattern", "scoring"))
     first = State(judge.examined(before))
     conditions = condition_scores(first.evidence.design) if far_off and not number else Singles()
@@ -133,6 +137,9 @@ def diagnose(
         conditions = condition_scores(first.evidence.design)
     if remainder is None or not remainder.number:
         state, remainder = beside_conditions(first, state, remainder, conditions)
+    if held is not model and remainder is None:  # else what is left would be taken for noise
+        state = judge.adopt(state, with_errors_free(state.evidence.result, model), state.steps)
+        before = before if state.steps else state.evidence.result
     after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, added) for step in state.steps)
     verdict: DiagnosisVerdict = "effect_found" if steps else "consistent"

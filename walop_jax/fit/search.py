@@ -110,7 +110,8 @@ def with_errors_fitted(
     at_start, values, found = likelihood, best.x, best
     for _ in range(ERROR_ROUNDS):
         taken = _taken_up(at_start, values, expansion)
-        live = dataclasses.replace(likelihood.with_errors_at(None), taken=taken)
+        live = likelihood.with_errors_at(None)
+        live = dataclasses.replace(live, taken=taken, light=likelihood.light_at(values))
         label = "fit with errors of the data"
         sought = _search(live, label, model.full(start[model.free], start), noise_scale, expansion)
         found = dataclasses.replace(sought, starts=best.starts, steps=found.steps + sought.steps)

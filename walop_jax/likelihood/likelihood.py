@@ -182,6 +182,16 @@ def prior_rows(model: Model) -> PriorRows:
     return PriorRows(at, np.array(mean, float), np.array(width, float), is_known)
 
 
+def of_rows(
+    held: Float[np.ndarray, "p e k"] | None, rows: slice, count: int
+) -> Float[np.ndarray, "b e k"] | None:
+    """Numbers of the points of a batch, filled up with zeros to `count` points; None where there are none."""
+    if held is None:
+        return None
+    own = held[rows]
+    return np.concatenate([own, np.zeros((count - len(own), *own.shape[1:]))])
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Likelihood(ShortDir):
     """The joint likelihood of one calibration set under one model.
@@ -192,7 +202,8 @@ class Likelihood(ShortDir):
 
     Errors of the data that have parameters (`model.noise`) are those of the values that a method is given, unless
     `errors_at` says at which values (a full vector) they are held: a fit hands on its likelihood with errors as fitted.
-    `taken` is the part of every intensity that the other parameters take up (`noise`), None: they take up none.
+    `taken` is the part of every intensity that the other parameters take up (`noise`), None: they take up none;
+    `light` is F u/N_ERR of all intensities where a search holds it, None: that of the values.
 
     >>> values, residual = result.likelihood.residuals(result.values)
     >>> residual.shape  # point, exposure, camera
@@ -200,7 +211,7 @@ class Likelihood(ShortDir):
     """
 
     _working = (
-        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "nodes",
+        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "light", "nodes",
         "points", "points_as_stated", "runner", "taken", "weak", "with_errors_at",
     )  # fmt: skip
 
@@ -210,6 +221,7 @@ class Likelihood(ShortDir):
     model: Model
     errors_at: Vector | None = None
     taken: Float[np.ndarray, "p e k"] | None = None
+    light: Float[np.ndarray, "p e k"] | None = None
 
     def __repr__(self) -> str:
         names, free = len(self.model.names), len(self.model.free)
@@ -373,11 +385,18 @@ class Likelihood(ShortDir):
         chi2, gradient, matrix = engine.normal_equations(instrument, self.plan, data, nodes)
         residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
         shared = engine.flux_groups(instrument, self.plan)
-        taken = np.zeros(counts.shape)
-        if self.taken is not None:
-            own = self.taken[rows]
-            taken[: len(own)] = own
-        of_errors = noise_expansion(noise, groups, counts, weight, residual, self.flux_known, shared, taken)
+        taken, light = (of_rows(held, rows, len(counts)) for held in (self.taken, self.light))
+        of_errors = noise_expansion(
+            noise,
+            groups,
+            counts,
+            weight,
+            residual,
+            self.flux_known,
+            shared,
+            0.0 if taken is None else taken,
+            light,
+        )
         at, gradient, matrix = self.model.positions(NOISE), np.array(gradient), np.array(matrix)
         gradient[at] += of_errors.gradient
         matrix[np.ix_(at, at)] += of_errors.matrix
@@ -471,6 +490,17 @@ class Likelihood(ShortDir):
         flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
         return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
 
+    def light_at(self, values: Vector) -> Float[np.ndarray, "p e k"]:
+        """F u/N_ERR of all intensities at a full vector of values, with the errors of these values; 0 where unused."""
+        counts, weight = map(self.points_as_stated.gathered, ("counts", "weight"))
+        residual = self.with_errors_at(values).residuals(values)[1]
+        noise = self.model.instrument(values).noise
+        if noise is not None:
+            residual = residual * np.sqrt(
+                variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
+            )
+        return np.where(weight > 0, counts * weight - residual, 0.0)
+
     @property
     def points_as_stated(self) -> MeasuredPoints:
         """The points with the errors that the set states, whatever was fitted of them."""
@@ -483,8 +513,7 @@ class Likelihood(ShortDir):
             return np.zeros((self.layout.points, len(self.calset.exposures)))
         counts, weight = map(self.points_as_stated.gathered, ("counts", "weight"))
         ratio = variance_ratio(noise, self.points.reader.noise_terms, counts, weight)
-        residual = self.with_errors_at(values).residuals(values)[1]
-        light = np.where(weight > 0, counts * weight / np.sqrt(ratio) - residual, 0.0)
+        light = self.light_at(values) / np.sqrt(ratio)
         shared = engine.flux_groups(self.model.template, self.plan)
         return log_variance(ratio, light, self.flux_known, shared)
 

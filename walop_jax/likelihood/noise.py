@@ -112,12 +112,18 @@ def noise_expansion(
     flux_known: Bool[np.ndarray, " e"],
     shared: FluxGroups = ALONE,
     taken: Float[np.ndarray, "p e k"] | float = 0.0,
+    light: Float[np.ndarray, "p e k"] | None = None,
 ) -> NoiseExpansion:
-    """The expansion at residuals r = (N − F u)/σ; `weight` is 1/N_ERR, `taken` the h of the head of this file."""
+    """The expansion at residuals r = (N − F u)/σ; `weight` is 1/N_ERR, `taken` the h of the head of this file.
+
+    `light` is F u/N_ERR, if it is not to be that of the residuals: a search that holds it has a gradient in the other
+    parameters that is complete without the third term of −2 ln L.
+    """
     ratio = variance_ratio(noise, terms, counts, weight)
-    modelled = weight / np.sqrt(ratio)
     used = weight > 0
-    light = np.where(used, counts * modelled - residual, 0.0)  # F u / σ
+    if light is None:
+        light = counts * weight - residual * np.sqrt(ratio)
+    light = np.where(used, light / np.sqrt(ratio), 0.0)  # F u / σ
     part, _ = _parts(light, flux_known, shared)
     slopes = _slopes(noise, terms, counts * weight, ratio) * used
     gradient = np.sum((1.0 - part - taken - residual**2) * slopes, axis=(1, 2, 3))
