@@ -2,7 +2,7 @@
 
 A fit of a model that lacks something takes the misfit for noise if its errors are free (`model/noise.py`): a ghost of
 3 % makes the scale of N_ERR 35, and no residual is left to find it by. While names are searched for, the errors are
-therefore held at what neither the parameters nor any candidate explains; in the model that is found they are free again.
+therefore held at what neither the parameters nor any candidate explains. In the model that is found they are free.
 
 Equation    the v that maximise −½ Σ r̃² − ½ Σ (1 − h̃) ln ρ(v) with its terms for the fluxes (`likelihood/noise.py`),
                 r̃ = P̃ r,   h̃ = diag (1 − P̃) − ê²

@@ -155,8 +155,8 @@ def _fitted_errors(result: FitResult) -> Iterator[str]:
     for name, value in zip(result.model.names, result.values.tolist(), strict=True):
         if name.startswith(COMMON) and value > thresholds.PART:
             yield (
-                f"the errors are fitted as {value:.3g} times N_ERR ({name}): they take a misfit for noise; diagnose "
-                "the set with its errors as stated, and fit errors once nothing is missing"
+                f"the errors are fitted as {value:.3g} times N_ERR ({name}): they take a misfit for noise; "
+                "walop-jax diagnose looks for the cause, with errors held at what no candidate explains"
             )
 
 
