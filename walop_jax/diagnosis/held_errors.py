@@ -30,7 +30,7 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.shapes import AnyVector
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import noise_expansion, variance_ratio
-from walop_jax.model.noise import FRACTION_START, NOISE
+from walop_jax.model.noise import FRACTION_START, NOISE, Noise
 from walop_jax.model.specification import Model
 
 ROUNDS = 2  # the projection hangs on the errors, a little: once more with those that were found
@@ -59,6 +59,29 @@ def with_errors_held(likelihood: Likelihood, examined: Callable[[FitResult], Exa
             return _held(model, stated)
         held = _held(model, errors_behind(examined(result), model))
     return held
+
+
+def held_closer(examination: Examination, model: Model) -> Model | None:
+    """The model with its free errors held at what is left behind additions that were found.
+
+    None where that is the same as they were held at (`thresholds.UNEVEN`), or where nothing is free. A far effect has
+    no linear step that explains it: before it is found, it makes the errors too large.
+    """
+    if not fits_errors(model):
+        return None
+    result, held = examination.result, _held(model, errors_behind(examination, model))
+    reader = result.likelihood.points.reader
+    block = reader.calset.intensities.block(0, len(reader.calset.points))
+    weight = np.where(block.used[..., None], 1.0 / block.sigma, 0.0)
+
+    def variances(noise: Noise | None) -> AnyVector:
+        assert noise is not None
+        return variance_ratio(noise, reader.noise_terms, block.counts, weight)[weight > 0]
+
+    before = variances(result.model.instrument(result.values).noise)
+    after = variances(held.instrument(held.start).noise)
+    same = np.abs(np.log(after / before)).max(initial=0.0) < np.log1p(thresholds.UNEVEN)
+    return None if same else held
 
 
 def with_errors_free(result: FitResult, model: Model) -> FitResult:
@@ -97,9 +120,12 @@ def errors_behind(examination: Examination, model: Model) -> AnyVector:
     free = np.isin(at, model.free)
     known = [(k, model.parameters[i].prior) for k, i in enumerate(at.tolist())]
 
-    def objective(of_free: AnyVector) -> tuple[float, AnyVector]:
+    size = np.full(len(start), FRACTION_START)
+    size[:scales] = max(result.noise_scale * examination.table.noise_scale, thresholds.ROUNDING)
+
+    def objective(in_sizes: AnyVector) -> tuple[float, AnyVector]:
         values = start.copy()
-        values[free] = of_free
+        values[free] = in_sizes * size[free]
         tried = dataclasses.replace(noise, scale=values[:scales], fraction=values[scales:])
         r = raw / np.sqrt(variance_ratio(tried, terms, block.counts, weight))
         found = noise_expansion(
@@ -110,12 +136,10 @@ def errors_behind(examination: Examination, model: Model) -> AnyVector:
             if prior is not None:
                 away = (values[k] - prior[0]) / prior[1]
                 value, gradient[k] = value + 0.5 * away**2, gradient[k] + away / prior[1]
-        return value, gradient[free]
+        return value, gradient[free] * size[free]
 
-    size = np.full(len(start), FRACTION_START)
-    size[:scales] = max(examination.table.noise_scale, thresholds.ROUNDING)
-    values = start.copy()
-    values[free] = np.abs(optimize.minimize(objective, size[free], jac=True, method="L-BFGS-B").x)
+    values, first = start.copy(), np.ones(np.count_nonzero(free))
+    values[free] = np.abs(optimize.minimize(objective, first, jac=True, method="BFGS").x) * size[free]
     assert design.rows == int(np.count_nonzero(weight))
     return values
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,10 +30,18 @@ from walop_jax.diagnosis.discrepancy import ambiguities
 from walop_jax.diagnosis.discrete import causes_before_a_fit, causes_of, refusal
 from walop_jax.diagnosis.exact import Trial, beyond_prior, signature, spoken_choices
 from walop_jax.diagnosis.examination import Examination, most_points
-from walop_jax.diagnosis.findings import Diagnosis, DiagnosisVerdict, Step, describe, descriptions_of
+from walop_jax.diagnosis.findings import (
+    Diagnosis,
+    DiagnosisVerdict,
+    Step,
+    Unexplained,
+    describe,
+    descriptions_of,
+)
 from walop_jax.diagnosis.grammar import hypotheses
-from walop_jax.diagnosis.held_errors import with_errors_free, with_errors_held
+from walop_jax.diagnosis.held_errors import fits_errors, held_closer, with_errors_free, with_errors_held
 from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.diagnosis.readings import Alternative
 from walop_jax.diagnosis.refits import Refits
 from walop_jax.diagnosis.remainder import (
     beside_conditions,
@@ -46,7 +55,7 @@ from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import examined
 from walop_jax.fit.base_model import base_model
-from walop_jax.fit.refit import NEARLY, fit, with_empirical_covariance
+from walop_jax.fit.refit import NEARLY, FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
@@ -107,37 +116,14 @@ def diagnose(
     )
     quiet = dataclasses.replace(judge, tell=lambda text: None)
     held = with_errors_held(Likelihood.of(sample, model), quiet.examined)
-    before = fit(Likelihood.of(sample, held))
-    far_off = before.noise_scale > 1.0
-    if causes is None or not (far_off or any(cause.number for cause in causes)):
-        causes = () if as_written else causes_of(before, structural, tell, descriptions=True)
-    number = causes[0].number if causes else ""
-    left = before.chi2 / max(before.dof, 1)
-    if causes and causes[0].of_data and (far_off or causes[0].explained < NEARLY):
-        raise refusal(left, causes)
-    if far_off:
-        judge = dataclasses.replace(judge, most=thresholds.MOST_FITS_FAR_OFF)
-    tell(Stage("scoring every effect and pattern", "scoring"))
-    first = State(judge.examined(before))
-    conditions = condition_scores(first.evidence.design) if far_off and not number else Singles()
-    if number:
-        remainder = wrong_number(first, number)
-    else:
-        remainder = instead_of_a_search(first, conditions) if not causes else None
-    if remainder is None:
-        begun = judge.with_causes(first, causes[0].effects if causes else ())
-        state, remainder = concluded(first, search(begun, judge), judge)
-    else:
-        state = first
-    explained = state.evidence.result
-    # Names left a remainder: a cause that leaves less (another reading, say) is then the answer.
-    if remainder and causes and not number and causes[0].explained * explained.dof < explained.chi2:
-        raise refusal(left, causes)
-    if not conditions.items and (state.steps or remainder):
-        conditions = condition_scores(first.evidence.design)
-    if remainder is None or not remainder.number:
-        state, remainder = beside_conditions(first, state, remainder, conditions)
-    if held is not model and remainder is None:  # else what is left would be taken for noise
+    found = _searched(fit(Likelihood.of(sample, held)), judge, causes, structural, as_written=as_written)
+    if found.state.steps and (better := held_closer(found.state.evidence, model)) is not None:
+        tell(Stage("errors of the data are better known with what was found: once more", "scoring"))
+        found = _searched(
+            fit(Likelihood.of(sample, better)), judge, causes, structural, as_written=as_written
+        )
+    before, first, state, remainder, conditions = found
+    if fits_errors(model) and remainder is None:  # else what is left would be taken for noise
         state = judge.adopt(state, with_errors_free(state.evidence.result, model), state.steps)
         before = before if state.steps else state.evidence.result
     after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
@@ -176,6 +162,60 @@ def diagnose(
     rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
     return _examined(diagnosis, tables, rivals, seed)
+
+
+class _Searched(NamedTuple):
+    """A fit, its examination, what was found beside it and what remains; the scores of `conditions` of the set."""
+
+    before: FitResult
+    first: State
+    state: State
+    remainder: Unexplained | None
+    conditions: Singles
+
+
+def _searched(
+    before: FitResult,
+    judge: Refits,
+    causes: tuple[Alternative, ...] | None,
+    structural: Sequence[Effect],
+    *,
+    as_written: bool,
+) -> _Searched:
+    """What a fit lacks; `causes` are those that were found ahead of it (None: they were not looked for).
+
+    Raises `DataError` for data that another reading explains.
+    """
+    far_off = before.noise_scale > 1.0
+    if causes is None or not (far_off or any(cause.number for cause in causes)):
+        causes = () if as_written else causes_of(before, structural, judge.tell, descriptions=True)
+    number = causes[0].number if causes else ""
+    left = before.chi2 / max(before.dof, 1)
+    if causes and causes[0].of_data and (far_off or causes[0].explained < NEARLY):
+        raise refusal(left, causes)
+    if far_off:
+        judge = dataclasses.replace(judge, most=thresholds.MOST_FITS_FAR_OFF)
+    judge.tell(Stage("scoring every effect and pattern", "scoring"))
+    first = State(judge.examined(before))
+    conditions = condition_scores(first.evidence.design) if far_off and not number else Singles()
+    if number:
+        remainder = wrong_number(first, number)
+    else:
+        remainder = instead_of_a_search(first, conditions) if not causes else None
+    if remainder is None:
+        begun = judge.with_causes(first, causes[0].effects if causes else ())
+        state, remainder = concluded(first, search(begun, judge), judge)
+    else:
+        state = first
+    explained = state.evidence.result
+    # Names left a remainder: a cause that leaves less (another reading, say) is then the answer.
+    if remainder and causes and not number and causes[0].explained * explained.dof < explained.chi2:
+        raise refusal(left, causes)
+    if not conditions.items and (state.steps or remainder):
+        conditions = condition_scores(first.evidence.design)
+    if remainder is None or not remainder.number:
+        state, remainder = beside_conditions(first, state, remainder, conditions)
+    return _Searched(before, first, state, remainder, conditions)
 
 
 def _members(first: State, state: State, steps: Sequence[Step]) -> Questions:
