@@ -290,6 +290,32 @@ def test_the_other_kinds_are_as_probable_whatever_the_size():
         assert sides["gain of O1 * kind clp; gain of O1 * kind moon"] == pytest.approx(sides[text])
 
 
+def test_what_standards_show_of_the_sky_ahead_may_be_there_for_stars():
+    """Light of standards is changed ahead of the polariser by 4·10⁻³: stars that are seen alike have it, or have not.
+
+    Their mean is half of it, and half of it is the error: M21 of a star by −0.5 · 4·10⁻³ (1 − M21²) to first order.
+    """
+    text = "diattenuation q ahead of polariser * kind standard"
+    result = fit_with(set_with(3, {text: 4e-3}), text)
+    state = examined_with(result, lambda name: name == text)
+    (found,) = ambiguities(state, {text: ()}).additions
+    sides = {m.name: m for m in found.members}
+    with_stars = sides[f"{text}, and of stars"]
+    assert with_stars.probability == pytest.approx(sides[text].probability)
+    assert found.spread > 1e-3
+    assert any("only a class of causes" in one for one in only_a_class(Questions(additions=(found,))))
+    alone = Calibration.from_fit(result.with_verdict())
+    product = averaged(alone, Questions(additions=(found,)))
+    x, y = np.array([0.1, -0.2]), np.array([0.05, 0.2])
+    (m, c), (one, within) = product.matrix(x, y), alone.matrix(x, y)
+    moved, error = (
+        np.abs(m - one)[:, :3].max(axis=1),
+        np.sqrt(np.abs(np.diagonal(c - within, axis1=1, axis2=2))),
+    )
+    np.testing.assert_allclose(moved, error[:, :3].max(axis=1), rtol=0.1)
+    assert moved == pytest.approx(2e-3, rel=0.3)
+
+
 def test_the_product_is_read_as_it_was_written(told, tmp_path):
     from walop_jax.calibration.product import write_calibration
 

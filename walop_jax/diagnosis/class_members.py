@@ -8,6 +8,8 @@ One step     A model without some amplitudes a leaves r + D of the residuals r, 
              the other columns J_o. Exact where everything is linear.
 Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
              show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
+             Ahead of the polariser there is no such change, as exposures through it would not show it: then "in KIND
+             standard, and when stars are observed", which are seen alike, is an equally probable member.
 Stars        A member changes the matrix by its own column, and through the shifts of the other parameters.
              Equivalent members count once. The product is their mean, and its covariance has their spread: values and
              covariance of a model that includes all of them, each amplitude 0 in the models of the others.
@@ -43,7 +45,10 @@ from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
 from walop_jax.model.effects.change import KINDS, Change, patched
 from walop_jax.model.effects.in_models import effects_of
+from walop_jax.model.effects.optics import GENERATORS
 
+_STANDARDS = "kind standard"
+"""The factor of a change in exposures of standards alone."""
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 
 
@@ -159,6 +164,8 @@ class LinearisedFit:
             members.append(member._replace(evidence=evidence))
         groups = self.distinct(members)
         both = [members[group[0]] for group in groups]
+        if whole and (same := step.on_stars_as_well(addition)) is not None:
+            both.append(same._replace(evidence=best))
         # Equivalent members count once: the counterpart in other KINDs is sought for one member of each group.
         for group in groups:
             twins = (step.in_other_kinds(by_step[i], None if i else widths) for i in group)
@@ -313,6 +320,32 @@ class LinearStep:
             widths = best_scale(*laid[name]) * smooth.widths_of(name)
             members.append((self.member(name, sums, column, widths, best + near[name] - own), True))
         return members
+
+    def on_stars_as_well(self, addition: Member) -> Member | None:
+        """The change of an addition ahead of the polariser in exposures of standards, as one of stars as well.
+
+        None for an addition of another kind. The residuals are the same.
+        """
+        changes, polariser = addition.changes, self.laid.template.polariser
+        ahead = None if polariser is None else ("ahead of", polariser.name)
+        of_standards = all(
+            c.kind in GENERATORS and (c.relation, c.place) == ahead and _STANDARDS in c.factors
+            for c in changes
+        )
+        if not changes or not of_standards:
+            return None
+
+        def everywhere(change: Change) -> Change:
+            return dataclasses.replace(change, factors=tuple(f for f in change.factors if f != _STANDARDS))
+
+        sums = tuple(tuple((size, everywhere(c)) for size, c in amplitude) for amplitude in addition.sums)
+        if not self._can_be_said(sums):
+            return None
+        column = self.laid.design.stacked([self.laid.columns.of(addition.sums)])
+        largest = context_of(self.laid.fit).largest
+        widths = np.array([amplitude[0][1].width(largest) for amplitude in addition.sums])
+        name = "; ".join(f"{change.text}, and of stars" for change in changes)
+        return self.member(name, sums, column, widths, addition.evidence)
 
     def in_other_kinds(self, member: Member, widths: AnyVector | None = None) -> Member | None:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.

@@ -30,7 +30,7 @@ from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.shapes import AnyVector
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.likelihood.noise import noise_expansion, variance_ratio
-from walop_jax.model.noise import FRACTION_START, NOISE, Noise
+from walop_jax.model.noise import FRACTION_START, NOISE
 from walop_jax.model.specification import Model
 
 ROUNDS = 2  # the projection hangs on the errors, a little: once more with those that were found
@@ -62,26 +62,40 @@ def with_errors_held(likelihood: Likelihood, examined: Callable[[FitResult], Exa
 
 
 def held_closer(examination: Examination, model: Model) -> Model | None:
-    """The model with its free errors held at what is left behind additions that were found.
+    """The model with its free errors held at what is left once additions were found.
 
-    None where that is the same as they were held at (`thresholds.UNEVEN`), or where nothing is free. A far effect has
-    no linear step that explains it: before it is found, it makes the errors too large.
+    A far effect has no linear step that explains it: before it is found, it makes the errors too large. They are those
+    of a fit with the additions; if that takes something for noise, so that a variance grows by more than
+    `thresholds.UNEVEN`, those behind all candidates. None where they are the same as before, or where nothing is free.
     """
     if not fits_errors(model):
         return None
-    result, held = examination.result, _held(model, errors_behind(examination, model))
+    result = examination.result
     reader = result.likelihood.points.reader
     block = reader.calset.intensities.block(0, len(reader.calset.points))
     weight = np.where(block.used[..., None], 1.0 / block.sigma, 0.0)
 
-    def variances(noise: Noise | None) -> AnyVector:
-        assert noise is not None
-        return variance_ratio(noise, reader.noise_terms, block.counts, weight)[weight > 0]
+    def grown(held: Model) -> AnyVector:
+        """ln of the variances of all data over those of the examination."""
+        before, after = result.model.instrument(result.values).noise, held.instrument(held.start).noise
+        assert before is not None
+        assert after is not None
+        old, new = (
+            variance_ratio(noise, reader.noise_terms, block.counts, weight) for noise in (before, after)
+        )
+        return np.log(new / old)[weight > 0]
 
-    before = variances(result.model.instrument(result.values).noise)
-    after = variances(held.instrument(held.start).noise)
-    same = np.abs(np.log(after / before)).max(initial=0.0) < np.log1p(thresholds.UNEVEN)
-    return None if same else held
+    most, free = np.log1p(thresholds.UNEVEN), with_errors_free(result, model)
+    values = free.values[[free.model.index(name) for name in _names(model)]]
+    held = _held(model, np.abs(values))
+    if grown(held).max(initial=0.0) > most:
+        held = _held(model, errors_behind(examination, model))
+    return None if np.abs(grown(held)).max(initial=0.0) < most else held
+
+
+def _names(model: Model) -> list[str]:
+    """Names of the errors of the data."""
+    return [model.parameters[i].name for i in model.positions(NOISE).tolist()]
 
 
 def with_errors_free(result: FitResult, model: Model) -> FitResult:

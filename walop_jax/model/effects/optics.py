@@ -11,7 +11,7 @@ Limits      exact for one kind at a place; the order of several kinds matters at
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -256,16 +256,28 @@ def _is_ahead(instrument: Instrument, change: Change) -> bool:
     return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
 
 
-def _with_sky_film(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    return instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(terms))))
+def _films_of_sky(
+    instrument: Instrument, terms: Sequence[Term], varies: Callable[[Change], bool]
+) -> tuple[Instrument, list[Term]]:
+    """The instrument with the terms ahead of the polariser that vary from exposure to exposure, and all other terms.
+
+    Those act on the light of calibration exposures alone; the steady ones are in the light path of stars as well.
+    """
+    of_film = [term for term in terms if _is_ahead(instrument, term[0]) and varies(term[0])]
+    others = [term for term in terms if not any(term is one for one in of_film)]
+    if of_film:
+        instrument = instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(of_film))))
+    return instrument, others
 
 
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; in the beam together with a moving element or polariser of that place."""
+    instrument, terms = _films_of_sky(
+        instrument, terms, lambda change: any(item.depends_on == EXPOSURE for item in change.grows_with)
+    )
+    if not terms:
+        return instrument
     change, polariser = terms[0][0], instrument.polariser
-    with_exposure = any(item.depends_on == EXPOSURE for change, _ in terms for item in change.grows_with)
-    if with_exposure and _is_ahead(instrument, change):
-        return _with_sky_film(instrument, terms)
     if change.relation == "of" and polariser is not None and change.place == polariser.name:
         return instrument.changed(change.place, films=lambda films: (*films, Film(**_columns(terms))))
     moves = instrument.element(change.place).moves if change.relation == "of" else None
@@ -289,8 +301,9 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
 
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
-    if _is_ahead(instrument, terms[0][0]) and any(change.factors for change, _ in terms):
-        return _with_sky_film(instrument, terms)
+    instrument, terms = _films_of_sky(instrument, terms, lambda change: bool(change.factors))
+    if not terms:
+        return instrument
     components: dict[str, Any] = dict.fromkeys("qu", jnp.zeros(()))
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
