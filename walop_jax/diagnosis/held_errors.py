@@ -70,19 +70,15 @@ def held_closer(examination: Examination, model: Model) -> Model | None:
     """
     if not fits_errors(model):
         return None
-    result = examination.result
-    reader = result.likelihood.points.reader
-    block = reader.calset.intensities.block(0, len(reader.calset.points))
-    weight = np.where(block.used[..., None], 1.0 / block.sigma, 0.0)
+    result, terms = examination.result, examination.result.likelihood.points.reader.noise_terms
+    counts, weight = map(result.likelihood.points_as_stated.gathered, ("counts", "weight"))
 
     def grown(held: Model) -> AnyVector:
         """ln of the variances of all data over those of the examination."""
         before, after = result.model.instrument(result.values).noise, held.instrument(held.start).noise
         assert before is not None
         assert after is not None
-        old, new = (
-            variance_ratio(noise, reader.noise_terms, block.counts, weight) for noise in (before, after)
-        )
+        old, new = (variance_ratio(noise, terms, counts, weight) for noise in (before, after))
         return np.log(new / old)[weight > 0]
 
     most, free = np.log1p(thresholds.UNEVEN), with_errors_free(result, model)
@@ -119,17 +115,18 @@ def _held(model: Model, values: AnyVector) -> Model:
 
 
 def errors_behind(examination: Examination, model: Model) -> AnyVector:
-    """Values of all errors of `model` that describe what is left behind the candidates of an examination."""
-    result, design = examination.result, examination.design
-    at, likelihood = model.positions(NOISE), result.likelihood
+    """Values of all errors of `model` that describe what is left behind the candidates of an examination.
+
+    Scales come first, then fractions, as among the parameters. What `model` holds keeps its value.
+    """
+    result, at = examination.result, model.positions(NOISE)
+    likelihood, terms = result.likelihood, result.likelihood.points.reader.noise_terms
     residual, taken = _behind_candidates(examination)
-    reader = likelihood.points.reader
-    block = reader.calset.intensities.block(0, len(reader.calset.points))
-    weight = np.where(block.used[..., None], 1.0 / block.sigma, 0.0)
-    noise, terms = result.model.instrument(result.values).noise, reader.noise_terms
+    counts, weight = map(likelihood.points_as_stated.gathered, ("counts", "weight"))
+    noise = result.model.instrument(result.values).noise
     assert noise is not None
     scales = len(noise.scales)
-    raw = residual * result.noise_scale * np.sqrt(variance_ratio(noise, terms, block.counts, weight))
+    raw = residual * result.noise_scale * np.sqrt(variance_ratio(noise, terms, counts, weight))
     start = np.concatenate([np.asarray(noise.scale, float), np.asarray(noise.fraction, float)])
     free = np.isin(at, model.free)
     known = [(k, model.parameters[i].prior) for k, i in enumerate(at.tolist())]
@@ -141,9 +138,9 @@ def errors_behind(examination: Examination, model: Model) -> AnyVector:
         values = start.copy()
         values[free] = in_sizes * size[free]
         tried = dataclasses.replace(noise, scale=values[:scales], fraction=values[scales:])
-        r = raw / np.sqrt(variance_ratio(tried, terms, block.counts, weight))
+        r = raw / np.sqrt(variance_ratio(tried, terms, counts, weight))
         found = noise_expansion(
-            tried, terms, block.counts, weight, r, likelihood.flux_known, likelihood.flux_groups, taken
+            tried, terms, counts, weight, r, likelihood.flux_known, likelihood.flux_groups, taken
         )
         value, gradient = 0.5 * (float(np.sum(r**2)) + found.value), found.gradient.copy()
         for k, prior in known:
@@ -154,7 +151,6 @@ def errors_behind(examination: Examination, model: Model) -> AnyVector:
 
     values, first = start.copy(), np.ones(np.count_nonzero(free))
     values[free] = np.abs(optimize.minimize(objective, first, jac=True, method="BFGS").x) * size[free]
-    assert design.rows == int(np.count_nonzero(weight))
     return values
 
 

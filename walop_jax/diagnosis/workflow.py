@@ -122,7 +122,8 @@ def diagnose(
         found = _searched(
             fit(Likelihood.of(sample, better)), judge, causes, structural, as_written=as_written
         )
-    before, first, state, remainder, conditions = found
+    before, first, state, remainder, conditions, judge = found
+    del found  # it holds the columns of all candidates
     if fits_errors(model) and remainder is None:  # else what is left would be taken for noise
         state = judge.adopt(state, with_errors_free(state.evidence.result, model), state.steps)
         before = before if state.steps else state.evidence.result
@@ -165,13 +166,17 @@ def diagnose(
 
 
 class _Searched(NamedTuple):
-    """A fit, its examination, what was found beside it and what remains; the scores of `conditions` of the set."""
+    """A fit, its examination, what was found beside it and what remains.
+
+    `conditions` are the scores of the numbers that the set states, `judge` that of the search.
+    """
 
     before: FitResult
     first: State
     state: State
     remainder: Unexplained | None
     conditions: Singles
+    judge: Refits
 
 
 def _searched(
@@ -215,7 +220,7 @@ def _searched(
         conditions = condition_scores(first.evidence.design)
     if remainder is None or not remainder.number:
         state, remainder = beside_conditions(first, state, remainder, conditions)
-    return _Searched(before, first, state, remainder, conditions)
+    return _Searched(before, first, state, remainder, conditions, judge)
 
 
 def _members(first: State, state: State, steps: Sequence[Step]) -> Questions:
