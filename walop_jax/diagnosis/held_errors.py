@@ -65,8 +65,8 @@ def held_closer(examination: Examination, model: Model) -> Model | None:
     """The model with its free errors held at what is left once additions were found.
 
     A far effect has no linear step that explains it: before it is found, it makes the errors too large. They are those
-    of a fit with the additions; if that takes something for noise, so that a variance grows by more than
-    `thresholds.UNEVEN`, those behind all candidates. None where they are the same as before, or where nothing is free.
+    of a fit with the additions; if that takes something for noise, so that variances grow by more than
+    `thresholds.UNEVEN` in the mean, those behind all candidates. None where they are the same as before, or where nothing is free.
     """
     if not fits_errors(model):
         return None
@@ -84,7 +84,7 @@ def held_closer(examination: Examination, model: Model) -> Model | None:
     most, free = np.log1p(thresholds.UNEVEN), with_errors_free(result, model)
     values = free.values[[free.model.index(name) for name in _names(model)]]
     held = _held(model, np.abs(values))
-    if grown(held).max(initial=0.0) > most:
+    if grown(held).mean() > most:
         held = _held(model, errors_behind(examination, model))
     return None if np.abs(grown(held)).max(initial=0.0) < most else held
 
