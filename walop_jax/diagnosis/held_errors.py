@@ -66,7 +66,8 @@ def held_closer(examination: Examination, model: Model) -> Model | None:
 
     A far effect has no linear step that explains it: before it is found, it makes the errors too large. They are those
     of a fit with the additions; if that takes something for noise, so that variances grow by more than
-    `thresholds.UNEVEN` in the mean, those behind all candidates. None where they are the same as before, or where nothing is free.
+    `thresholds.UNEVEN` in the mean, those behind all candidates. None where they are the same as before, or where
+    nothing is free.
     """
     if not fits_errors(model):
         return None
