@@ -48,6 +48,10 @@ def residuals(*texts: str) -> np.ndarray:
             "added polarisation q ahead of polariser",
             "added polarisation q ahead of polariser * kind moon",
         ),
+        (
+            "added polarisation q ahead of polariser * x",
+            "added polarisation q ahead of polariser * kind moon",
+        ),
     ],
 )
 def test_a_steady_change_acts_on_stars_beside_one_that_varies(steady: str, varying: str):
@@ -58,3 +62,11 @@ def test_a_steady_change_acts_on_stars_beside_one_that_varies(steady: str, varyi
     bare = residuals()
     first, second, both = (residuals(*texts) - bare for texts in ((steady,), (varying,), (steady, varying)))
     np.testing.assert_allclose(both, first + second, atol=5e-3 * np.abs(both).max())
+
+
+def test_polarisation_that_is_added_over_the_field_is_added_to_stars():
+    """Against one that is even: at X it has the size of X over the unit of the field."""
+    even = of_stars("added polarisation q ahead of polariser") - of_stars()
+    tilted = of_stars("added polarisation q ahead of polariser * x") - of_stars()
+    share = np.array([0.1, -0.2]) / base_model(CALSET).template.units.field
+    np.testing.assert_allclose(tilted, even * share[:, None, None], rtol=5e-3, atol=1e-8)

@@ -11,7 +11,7 @@ Limits      exact for one kind at a place; the order of several kinds matters at
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -135,7 +135,12 @@ class Terms(Element):
         """Mueller matrices of all the changes together at the wavelengths of a ray."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
-        return matrix_of(sizes, ray.x, ray.y)
+        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
+        matrix = matrix_of(acting, ray.x, ray.y) if acting else jnp.eye(4)
+        for change, size in sizes:
+            if change.kind in ADDED:
+                matrix = matrix + jnp.asarray(size)[..., None, None] * generator(change.kind) @ matrix
+        return matrix
 
 
 class Film(Component):
@@ -256,15 +261,15 @@ def _is_ahead(instrument: Instrument, change: Change) -> bool:
     return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
 
 
-def _films_of_sky(
-    instrument: Instrument, terms: Sequence[Term], varies: Callable[[Change], bool]
-) -> tuple[Instrument, list[Term]]:
+def _films_of_sky(instrument: Instrument, terms: Sequence[Term]) -> tuple[Instrument, list[Term]]:
     """The instrument with the terms ahead of the polariser that vary from exposure to exposure, and all other terms.
 
     Those act on the light of calibration exposures alone; the steady ones are in the light path of stars as well.
     """
-    of_film = [term for term in terms if _is_ahead(instrument, term[0]) and varies(term[0])]
-    others = [term for term in terms if not any(term is one for one in of_film)]
+    of_film, others = list[Term](), list[Term]()
+    for term in terms:
+        varies = any(item.depends_on == EXPOSURE for item in term[0].grows_with)
+        (of_film if varies and _is_ahead(instrument, term[0]) else others).append(term)
     if of_film:
         instrument = instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(of_film))))
     return instrument, others
@@ -272,9 +277,7 @@ def _films_of_sky(
 
 def _optics(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """One more element at the place; in the beam together with a moving element or polariser of that place."""
-    instrument, terms = _films_of_sky(
-        instrument, terms, lambda change: any(item.depends_on == EXPOSURE for item in change.grows_with)
-    )
+    instrument, terms = _films_of_sky(instrument, terms)
     if not terms:
         return instrument
     change, polariser = terms[0][0], instrument.polariser
@@ -301,14 +304,17 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
 
 def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """(0, q, u, 0) per unit of light added, as mirrors of a telescope do to weakly polarised light."""
-    instrument, terms = _films_of_sky(instrument, terms, lambda change: bool(change.factors))
+    instrument, terms = _films_of_sky(instrument, terms)
     if not terms:
         return instrument
+    change = terms[0][0]
+    if any(one.factors for one, _ in terms):  # over the field
+        return beside(instrument, Terms(name="described", **_columns(terms)), change.relation, change.place)
     components: dict[str, Any] = dict.fromkeys("qu", jnp.zeros(()))
     for item, size in terms:
         components[item.kind[-1]] = components[item.kind[-1]] + size
     element = AddedPolarisation(name="described", **components)
-    return beside(instrument, element, terms[0][0].relation, terms[0][0].place)
+    return beside(instrument, element, change.relation, change.place)
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
