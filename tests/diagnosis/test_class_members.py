@@ -16,8 +16,8 @@ from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import (
-    Member,
-    Question,
+    Answer,
+    OpenQuestion,
     Questions,
     _with_ties,
     averaged,
@@ -189,11 +189,11 @@ def test_members_that_say_a_name_in_other_words_move_its_parameter(turned):
     sums = (((1.0, Change.parsed(text)),),)
     none = np.zeros((len(fit.calset.points), 6))
     members = (
-        Member("hwp2_axis", 0.0, sums, none, probability=0.5),
-        Member(text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5),
+        Answer("hwp2_axis", 0.0, sums, none, probability=0.5),
+        Answer(text, 0.0, sums, none, np.array([b]), np.array([[t**2]]), back, np.zeros((len(zero), 1)), 0.5),
     )
     alone = Calibration.from_fit(fit.with_verdict())
-    product = averaged(alone, Questions(additions=(Question("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
+    product = averaged(alone, Questions(additions=(OpenQuestion("hwp2_axis", at, members, 0.0, 0.0, 0.0),)))
     assert product.model.names == alone.model.names
     place = product.model.index("hwp2_axis.angle")
     assert product.values[place] == pytest.approx(0.5 * (a + b), rel=1e-12)

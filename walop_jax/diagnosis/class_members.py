@@ -32,7 +32,7 @@ from scipy import special
 from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Member, Question, WeightedChanges, changes_in, distinct
+from walop_jax.diagnosis.class_product import Answer, OpenQuestion, WeightedChanges, changes_in, distinct
 from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import texts_of
@@ -54,7 +54,7 @@ MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with di
 
 def classes_of(
     laid: LinearisedFit, added: Mapping[str, Collection[str]], given: Collection[str] = ()
-) -> tuple[Question, ...]:
+) -> tuple[OpenQuestion, ...]:
     """The classes of what was added to a model, without those of a single member.
 
     `added` are effects and groups of descriptions, by name, each with the candidates reported as indistinguishable from
@@ -62,7 +62,7 @@ def classes_of(
     that the model had before.
     """
     fit, model, design = laid.fit, laid.fit.model, laid.design
-    groups, classes = [name for name in added if name not in model.effect_names], list[Question]()
+    groups, classes = [name for name in added if name not in model.effect_names], list[OpenQuestion]()
     for effect in effects_of(model):
         at = design.columns_of(model.positions(effect.name))
         if effect.name in added and not effect.kind.is_structural() and len(at):
@@ -146,7 +146,7 @@ class LinearisedFit:
         sums: tuple[WeightedChanges, ...],
         alike: Collection[str],
         whole: frozenset[str],
-    ) -> Question:
+    ) -> OpenQuestion:
         """Class of the addition with the amplitudes `at`; without it the residuals change by `lost`.
 
         `alike` are candidates reported as indistinguishable from it: probable, if their amplitudes are plausible.
@@ -177,9 +177,9 @@ class LinearisedFit:
         chosen = [
             member._replace(probability=float(weight)) for member, weight in zip(chosen, weights, strict=True)
         ]
-        return Question(name, at, tuple(chosen), *self._spread(chosen))
+        return OpenQuestion(name, at, tuple(chosen), *self._spread(chosen))
 
-    def distinct(self, members: Sequence[Member]) -> list[list[int]]:
+    def distinct(self, members: Sequence[Answer]) -> list[list[int]]:
         """Groups of members that change the matrix alike: that of the first member, then the most probable first."""
         evidence = np.array([np.inf, *(member.evidence for member in members[1:])])
         return distinct(evidence, np.stack([member.change for member in members]), self.errors, ALIKE)
@@ -193,8 +193,8 @@ class LinearisedFit:
             return best
         return min(best, evidence + max(thresholds.LINEAR_GOOD, thresholds.LINEAR * abs(best)))
 
-    def _spread(self, members: Sequence[Member]) -> tuple[float, float, float]:
-        """Error of p of stars between members, error of the fit, and largest deviation of a member (`Question`)."""
+    def _spread(self, members: Sequence[Answer]) -> tuple[float, float, float]:
+        """Error of p of stars between members, error of the fit, and largest deviation of a member (`OpenQuestion`)."""
         weights = np.array([member.probability for member in members])
         away = np.stack([member.change for member in members])
         away = away - np.tensordot(weights, away, 1)
@@ -230,7 +230,7 @@ class LinearStep:
         self.projector, self.basis = design.without(at)
         self.left = self.projector(design.residual + self.lost)
 
-    def addition(self, name: str, sums: tuple[WeightedChanges, ...]) -> tuple[Member, AnyVector]:
+    def addition(self, name: str, sums: tuple[WeightedChanges, ...]) -> tuple[Answer, AnyVector]:
         """The addition itself as a member, with its fitted values, and its prior widths."""
         fit, design, scatter = self.laid.fit, self.laid.design, self.laid.state.scatter
         positions = fit.model.free[self.at]
@@ -240,11 +240,11 @@ class LinearStep:
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
         widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
         evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / scatter**2
-        return Member(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
+        return Answer(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
     def candidates(
-        self, addition: Member, alike: Collection[str], whole: frozenset[str]
-    ) -> tuple[float, list[tuple[Member, bool]]]:
+        self, addition: Answer, alike: Collection[str], whole: frozenset[str]
+    ) -> tuple[float, list[tuple[Answer, bool]]]:
         """The best evidence, and candidates not improbable relative to it; `alike` and `whole` as in `class_of`.
 
         Each candidate comes with True if it is among `alike`. A change that the model has already is no candidate for
@@ -291,8 +291,8 @@ class LinearStep:
         return best, members
 
     def smooth_fields(
-        self, addition: Member, best: float, whole: frozenset[str]
-    ) -> list[tuple[Member, bool]]:
+        self, addition: Answer, best: float, whole: frozenset[str]
+    ) -> list[tuple[Answer, bool]]:
         """Members of the class of a smooth field: others that would not be improbable in its place.
 
         They are listed as `candidates` lists others. Beside the model without the addition the Gram matrix of a field
@@ -310,7 +310,7 @@ class LinearStep:
         evidence = {name: log_bayes(*of) / self.laid.state.scatter**2 for name, of in laid.items()}
         own = max((value for name, value in evidence.items() if names == set(name.split("; "))), default=best)
         near = {name: value for name, value in evidence.items() if value > own - thresholds.IMPROBABLE}
-        members = list[tuple[Member, bool]]()
+        members = list[tuple[Answer, bool]]()
         for name in sorted(near, key=near.__getitem__, reverse=True)[: thresholds.MOST_CLASSES]:
             (member,) = smooth.probe(name).group
             sums = tuple(map(tuple, member.first_order(self.laid.template)))
@@ -321,7 +321,7 @@ class LinearStep:
             members.append((self.member(name, sums, column, widths, best + near[name] - own), True))
         return members
 
-    def on_stars_as_well(self, addition: Member) -> Member | None:
+    def on_stars_as_well(self, addition: Answer) -> Answer | None:
         """The change of an addition ahead of the polariser in exposures of standards, as one of stars as well.
 
         None for an addition of another kind. The residuals are the same.
@@ -347,7 +347,7 @@ class LinearStep:
         name = "; ".join(f"{change.text}, and of stars" for change in changes)
         return self.member(name, sums, column, widths, addition.evidence)
 
-    def in_other_kinds(self, member: Member, widths: AnyVector | None = None) -> Member | None:
+    def in_other_kinds(self, member: Answer, widths: AnyVector | None = None) -> Answer | None:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
 
         None for a member that is not about one KIND. The `evidence` of the counterpart is given relative to that of the
@@ -394,7 +394,7 @@ class LinearStep:
         column: AnyMatrix,
         widths: AnyVector,
         evidence: float | None = None,
-    ) -> Member:
+    ) -> Answer:
         """The member with the amplitudes `sums` in the place of the addition, at the minimum of that model.
 
         `evidence`, if it is given, replaces the evidence of the linear step.
@@ -415,7 +415,7 @@ class LinearStep:
         vectors, added = laid.added(sums)
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
-        return Member(name, evidence, sums, change, amplitudes, covariance, values, slopes)
+        return Answer(name, evidence, sums, change, amplitudes, covariance, values, slopes)
 
     def _can_be_said(self, sums: Sequence[WeightedChanges]) -> bool:
         """True if a model can include all descriptions."""

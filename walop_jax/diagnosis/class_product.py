@@ -50,7 +50,7 @@ def changes_in(sums: Sequence[WeightedChanges]) -> list[Change]:
     return [description for amplitude in sums for _, description in amplitude]
 
 
-class Member(NamedTuple):
+class Answer(NamedTuple):
     """One answer to a question: its words, ln B against the model without what was added, its amplitudes in changes.
 
     `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
@@ -83,7 +83,7 @@ class Member(NamedTuple):
         return tuple(total if j in self.acting else () for j, total in enumerate(self.sums))
 
 
-class Question(NamedTuple):
+class OpenQuestion(NamedTuple):
     """What a diagnosis leaves open about one thing, and the possible answers.
 
     Without an independent zero of the polariser `clp_zero` and `rotator_zero` are the members of a class: both turn the
@@ -98,14 +98,14 @@ class Question(NamedTuple):
 
     about: str
     at: Int[np.ndarray, " a"]
-    members: tuple[Member, ...]
+    members: tuple[Answer, ...]
     spread: float
     stated: float
     off: float = 0.0
     effect: str = Described.name
 
     @classmethod
-    def of_errors(cls, about: str, member: Member, spread: float, stated: float) -> Question:
+    def of_errors(cls, about: str, member: Answer, spread: float, stated: float) -> OpenQuestion:
         """A question with one answer: changes that are in the errors of the product, and not in its values."""
         return cls(about, np.zeros(0, int), (member,), spread, stated, 0.0, Deviations.name)
 
@@ -121,9 +121,9 @@ class Questions(NamedTuple):
     `undetected` are changes that the data would not show.
     """
 
-    additions: tuple[Question, ...] = ()
-    shape: Question | None = None
-    undetected: Question | None = None
+    additions: tuple[OpenQuestion, ...] = ()
+    shape: OpenQuestion | None = None
+    undetected: OpenQuestion | None = None
 
     def __bool__(self) -> bool:
         return self.several or self.undetected is not None
@@ -134,7 +134,7 @@ class Questions(NamedTuple):
         return bool(self.additions) or self.shape is not None
 
     @property
-    def of_errors(self) -> tuple[Question, ...]:
+    def of_errors(self) -> tuple[OpenQuestion, ...]:
         """Those whose changes are in the errors of the product alone."""
         return tuple(one for one in (self.shape, self.undetected) if one is not None)
 
@@ -373,7 +373,7 @@ def _dominates(spread: float, stated: float) -> bool:
     return spread > min(GOAL, max(stated, thresholds.NEGLIGIBLE))
 
 
-def _deciding(group: Question) -> str:
+def _deciding(group: OpenQuestion) -> str:
     """Observations that would distinguish the members."""
     tests = [s.tested_by for member in group.members for total in member.sums for _, s in total[:1]]
     observations = some(list(dict.fromkeys(tests)), 2) if tests else "other exposures"

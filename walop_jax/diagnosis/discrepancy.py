@@ -43,7 +43,7 @@ from scipy import special
 from walop_jax.calibration.matrix import of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
-from walop_jax.diagnosis.class_product import Member, Question, Questions, WeightedChanges, mixture
+from walop_jax.diagnosis.class_product import Answer, OpenQuestion, Questions, WeightedChanges, mixture
 from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.hypotheses import Probe
@@ -93,7 +93,7 @@ def _slopes(
 # ------------------------------------------------------------------------------ deviations from a description
 
 
-def shape_of(laid: LinearisedFit) -> Question | None:
+def shape_of(laid: LinearisedFit) -> OpenQuestion | None:
     """Deviations from the shapes of all descriptions, by one linear step; None without a description."""
     if FreeForm.name in laid.fit.model.effect_names:  # it has every shape
         return None
@@ -115,10 +115,12 @@ def shape_of(laid: LinearisedFit) -> Question | None:
         j for j, c in enumerate(changes) if acting[j] and c.applies_to_catalogue and c.beside_field in laws
     )
     member = member._replace(acting=on_stars)
-    return Question.of_errors("deviations from descriptions", member, laid.error_of_p(between), laid.stated)
+    return OpenQuestion.of_errors(
+        "deviations from descriptions", member, laid.error_of_p(between), laid.stated
+    )
 
 
-def _of_second_moment(member: Member) -> Member:
+def _of_second_moment(member: Answer) -> Answer:
     """The member with the mean 0 of its amplitudes c and E[c cᵀ] as their covariance: values are those of the fit."""
     moment = member.covariance + np.outer(member.amplitudes, member.amplitudes)
     count = len(member.values)
@@ -237,7 +239,7 @@ class _Block(NamedTuple):
     slopes: AnyMatrix
 
 
-def undetected(laid: LinearisedFit) -> Question | None:
+def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     """Covariance of undetected changes, expressed by changes ahead of the train; None if there are no such changes."""
     if not (places := _steady_places(laid)):
         return None
@@ -263,7 +265,7 @@ def undetected(laid: LinearisedFit) -> Question | None:
         return None
     covariance = loadings @ loadings.T
     between = slopes[..., chosen] @ covariance @ np.swapaxes(slopes[..., chosen], 1, 2)
-    member = Member(
+    member = Answer(
         "undetected",
         0.0,
         tuple(ahead.sums[j] for j in chosen),
@@ -271,7 +273,7 @@ def undetected(laid: LinearisedFit) -> Question | None:
         covariance=covariance,
         slopes=ahead.slopes[:, chosen],
     )
-    return Question.of_errors(
+    return OpenQuestion.of_errors(
         "changes that the data would not show", member, laid.error_of_p(between), laid.stated
     )
 

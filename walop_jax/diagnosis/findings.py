@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.records import Exposures
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.class_product import Question, Questions
+from walop_jax.diagnosis.class_product import OpenQuestion, Questions
 from walop_jax.diagnosis.design import Design, positions_of
 from walop_jax.diagnosis.reasons import why
 from walop_jax.fit.refit import FitResult
@@ -645,7 +645,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
     return plain(content)
 
 
-def _shape(shape: Question | None) -> dict[str, Any] | None:
+def _shape(shape: OpenQuestion | None) -> dict[str, Any] | None:
     """The entry of deviations that are in the product."""
     if shape is None:
         return None
