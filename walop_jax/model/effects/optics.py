@@ -39,7 +39,6 @@ from walop_jax.model.effects.change import (
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, SHAPE, WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
-from walop_jax.model.elements.simple import AddedPolarisation
 from walop_jax.model.elements.wave_plate import AirGap
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Component
@@ -82,13 +81,23 @@ def generators_of(kind: str) -> tuple[tuple[str, float, tuple[str, ...]], ...]:
 
 
 def matrix_of(terms: Sequence[tuple[Change, Any]], x: Any, y: Any) -> Mueller:
-    """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg)."""
+    """Mueller matrix of changes of given sizes (amplitude × factor; arrays) at a field point (deg).
+
+    Polarisation that is `ADDED` is added to the light that has passed all other changes.
+    """
     sums: dict[str, Any] = {}  # retardance (rad), diattenuation; the fraction that is lost
+    added = list[tuple[str, Any]]()
     for change, size in terms:
+        if change.kind in ADDED:
+            added.append((change.kind, jnp.asarray(size)))
+            continue
         for name, coefficient, factors in generators_of(change.kind):
             by = coefficient * product(factors, AtPoint(x, y), change.units)
             sums[name] = sums.get(name, 0.0) + by * size
-    return near_identity(sums)
+    matrix = near_identity(sums) if sums else jnp.eye(4)
+    for kind, size in added:
+        matrix = matrix + size[..., None, None] * generator(kind) @ matrix
+    return matrix
 
 
 def near_identity(sums: Mapping[str, Any]) -> Mueller:
@@ -135,12 +144,7 @@ class Terms(Element):
         """Mueller matrices of all the changes together at the wavelengths of a ray."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
-        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
-        matrix = matrix_of(acting, ray.x, ray.y) if acting else jnp.eye(4)
-        for change, size in sizes:
-            if change.kind in ADDED:
-                matrix = matrix + jnp.asarray(size)[..., None, None] * generator(change.kind) @ matrix
-        return matrix
+        return matrix_of(sizes, ray.x, ray.y)
 
 
 class Film(Component):
@@ -159,13 +163,7 @@ class Film(Component):
         """Stokes vectors (e, 4) behind the film at a field point, one for each exposure."""
         terms = zip(self.changes, self.amplitudes, strict=True)
         sizes = [(change, size * in_exposures(change, exposures, x, y)) for change, size in terms]
-        acting = [(change, size) for change, size in sizes if change.kind not in ADDED]
-        if acting:
-            light = jnp.einsum("est,et->es", matrix_of(acting, x, y), light)
-        for change, size in sizes:
-            if change.kind in ADDED:
-                light = light.at[:, 1 + "qu".index(change.kind[-1])].add(size * light[:, 0])
-        return light
+        return jnp.einsum("est,et->es", matrix_of(sizes, x, y), light)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,13 +306,7 @@ def _added(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     if not terms:
         return instrument
     change = terms[0][0]
-    if any(one.factors for one, _ in terms):  # over the field
-        return beside(instrument, Terms(name="described", **_columns(terms)), change.relation, change.place)
-    components: dict[str, Any] = dict.fromkeys("qu", jnp.zeros(()))
-    for item, size in terms:
-        components[item.kind[-1]] = components[item.kind[-1]] + size
-    element = AddedPolarisation(name="described", **components)
-    return beside(instrument, element, change.relation, change.place)
+    return beside(instrument, Terms(name="described", **_columns(terms)), change.relation, change.place)
 
 
 def _grows_added(instrument: Instrument, change: Change) -> Grows:
