@@ -1,4 +1,4 @@
-"""Questions of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
+"""Classes of what was added: whom data cannot tell from it, what each does to the matrix, and the product of them."""
 
 import dataclasses
 import json

@@ -342,10 +342,8 @@ class LinearStep:
         if not self._can_be_said(sums):
             return None
         column = self.laid.design.stacked([self.laid.columns.of(addition.sums)])
-        largest = context_of(self.laid.fit).largest
-        widths = np.array([amplitude[0][1].width(largest) for amplitude in addition.sums])
         name = "; ".join(f"{change.text}, and of stars" for change in changes)
-        return self.member(name, sums, column, widths, addition.evidence)
+        return self.member(name, sums, column, self._widths(addition.sums), addition.evidence)
 
     def in_other_kinds(self, member: Answer, widths: AnyVector | None = None) -> Answer | None:
         """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
@@ -377,9 +375,7 @@ class LinearStep:
         if not self._can_be_said(sums):
             return None
         column = design.stacked([self.laid.columns.of(sums)])
-        if widths is None:
-            largest = context_of(self.laid.fit).largest
-            widths = np.array([amplitude[0][1].width(largest) for amplitude in sums])
+        widths = self._widths(sums) if widths is None else widths
         name = "; ".join(description.text for description in changes_in(sums))
         twin = self.member(name, sums, column, widths)
         # It is the same difference between KINDs, told from the other side: as probable, whatever the throughputs are.
@@ -416,6 +412,11 @@ class LinearStep:
         change = of_matrix(vectors, added @ amplitudes, laid.template.cameras.pairs)
         change = change.reshape(laid.matrix.shape) + laid.slopes @ values
         return Answer(name, evidence, sums, change, amplitudes, covariance, values, slopes)
+
+    def _widths(self, sums: Sequence[WeightedChanges]) -> AnyVector:
+        """Prior widths of amplitudes, each that of its first change."""
+        largest = context_of(self.laid.fit).largest
+        return np.array([amplitude[0][1].width(largest) for amplitude in sums])
 
     def _can_be_said(self, sums: Sequence[WeightedChanges]) -> bool:
         """True if a model can include all descriptions."""

@@ -66,7 +66,7 @@ DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in na
 def ambiguities(
     state: Examination, added: Mapping[str, Collection[str]], given: Collection[str] = ()
 ) -> Questions:
-    """Questions of the additions to a model, shapes of its descriptions, and undetected changes.
+    """Classes of the additions to a model, deviations from its descriptions, and undetected changes.
 
     `added` are effects and groups of descriptions, by name, each with the candidates that are reported as
     indistinguishable from it, `given` descriptions that the model had before (`class_members.classes_of`).

@@ -386,17 +386,8 @@ class Likelihood(ShortDir):
         residual = np.asarray(engine.residuals(instrument, self.plan, data, nodes)[1])
         shared = engine.flux_groups(instrument, self.plan)
         taken, light = (of_rows(held, rows, len(counts)) for held in (self.taken, self.light))
-        of_errors = noise_expansion(
-            noise,
-            groups,
-            counts,
-            weight,
-            residual,
-            self.flux_known,
-            shared,
-            0.0 if taken is None else taken,
-            light,
-        )
+        at_values = noise, groups, counts, weight, residual, self.flux_known, shared
+        of_errors = noise_expansion(*at_values, taken=0.0 if taken is None else taken, light=light)
         at, gradient, matrix = self.model.positions(NOISE), np.array(gradient), np.array(matrix)
         gradient[at] += of_errors.gradient
         matrix[np.ix_(at, at)] += of_errors.matrix
