@@ -471,13 +471,19 @@ def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
     moved = design.fit.model.selection() @ taken_up
     stars = Starlight.everywhere(design, ())
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
-    limits = []
-    for number, item in enumerate(scored.items):
-        stated = item.stated
-        # Of errors as stated, not of the residuals: a plan has none.
-        detected = float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
-        size = min(detected, stated.error)
-        slope = stars.slope_by_number(stated) if stated.seen_by_stars else 0.0
-        error = over_field(stars.errors([size * slope], size * moved[None, :, number]))
-        limits.append(ConditionLimit(stated.what, stated.unit, detected, size, error))
-    return tuple(limits)
+    # Of errors as stated, not of the residuals: a plan has none.
+    detected = [
+        float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
+        for item in scored.items
+    ]
+    every = [item.stated for item in scored.items]
+    sizes = np.array([min(found, stated.error) for found, stated in zip(detected, every, strict=True)])
+    changes = [
+        size * stars.slope_by_number(stated) if stated.seen_by_stars else 0.0
+        for size, stated in zip(sizes.tolist(), every, strict=True)
+    ]
+    errors = stars.errors(changes, sizes[:, None] * moved.T)
+    return tuple(
+        ConditionLimit(stated.what, stated.unit, found, size, over_field(error[None]))
+        for stated, found, size, error in zip(every, detected, sizes.tolist(), errors, strict=True)
+    )

@@ -21,9 +21,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -222,20 +221,10 @@ def _of_fringes(terms: Iterable[tuple[float, Change]]) -> bool:
 
 
 def _at_size(probe: Probe, number: int, size: float) -> Effect:
-    """One amplitude of a probe by itself, at its size."""
+    """The effect of a probe with one amplitude alone, at its size."""
     step = np.zeros(len(probe.widths))
     step[number] = size
-    remaining = iter(step.tolist())
-    for member in probe.group:
-        moved = dict[str, Any]()
-        for name in probe.effect.amplitudes():
-            neutral = np.asarray(getattr(member, name), float)
-            by = np.reshape([next(remaining) for _ in range(neutral.size)], neutral.shape)
-            if by.any():
-                moved[name] = jnp.asarray(neutral + by)
-        if moved:
-            return member.replaced(**moved)
-    return probe.group[0]
+    return probe.effect.combine(probe.group, step)
 
 
 def usual_exposure(calset: CalibrationSet, instrument: Instrument) -> int:
