@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from walop_jax.io.errors import DataError
 from walop_jax.model import light, mueller
 from walop_jax.model.effects import Described, Effect
 from walop_jax.model.effects.base import Scalar
@@ -157,3 +158,13 @@ def test_thick_plates_of_another_temperature_are_followed():
     together = rows_of(device, rows)
     alone = rows_of(device, [rows[0], rows[9]])
     np.testing.assert_allclose(together[9], alone[1], rtol=0.0, atol=1e-9)
+
+
+def test_plates_that_cannot_be_meant_are_refused():
+    """Quartz of 2407 µm that is entered in picometres has 3·10⁷ waves: no rule for the band holds its fringes."""
+    wrong = DEVICE.changed(
+        "half1.plate",
+        layers=lambda layers: (dataclasses.replace(layers[0], thickness=jnp.asarray(2.407e9)),),
+    )
+    with pytest.raises(DataError, match=r"filter band: .*waves.*thicknesses of its plates, which are in µm"):
+        plan_for(wrong, builders.exposures(ROWS[0]), CURVE)

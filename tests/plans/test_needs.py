@@ -105,4 +105,8 @@ def test_p_known_in_half_of_the_field():
     assert known_in_half(4.9e-4).met
     assert not known_in_half(5.1e-4).met
     assert "4.0 times the light" in known_in_half(1e-3).advice
-    assert "plate at 22.5°" in known_in_half(np.inf).advice
+    # Light alone does not measure a polarisation of 5 % to within itself: another setting does.
+    assert "times the light" in known_in_half(0.049).advice
+    for unknown in (np.inf, 0.051, 180.0):
+        assert "plate at 22.5°" in known_in_half(unknown).advice
+        assert "times the light" not in known_in_half(unknown).advice

@@ -41,6 +41,7 @@ polynomial of seventh degree, and to 2(a/2)⁸/8! for a phase that changes by ±
 INTERPOLATED = 1e-10
 """Largest error of a phase factor between these values: thick plates have more of them in temperature."""
 SAMPLES = 9  # wavelengths of a band with a monotonic retardance between them
+THICKEST = 1e4  # waves at 0.62 µm of all retarders in series: 0.7 m of quartz, 4 cm of calcite
 ROOM = 1.03  # growth of a thickness in a fit, and of an oblique path, that the nodes allow
 
 
@@ -235,6 +236,7 @@ def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> 
     plate.
 
     Retarders in series interfere at the sum of their retardances. Nodes are made for `room` times as many waves.
+    Raises `DataError` for more than `THICKEST` waves.
     """
     wavelengths = curve.wavelength[curve.throughput > 0]
     at = np.linspace(wavelengths.min(), wavelengths.max(), SAMPLES) if wavelengths.size else curve.wavelength
@@ -246,6 +248,12 @@ def _fringes(instrument: Instrument, curve: FilterCurve, room: float = ROOM) -> 
             (waves_over(at, sums) - waves_over(at, together) for together, sums in retardances), default=0.0
         )
         bright, faint = max(bright, summed), max(faint, summed + layers)
+    if faint > THICKEST:
+        raise fail(
+            f"filter {curve.name}: the retarders of the instrument together have {faint:.2g} waves, too many for their "
+            "fringes to be followed",
+            advice="check the thicknesses of its plates, which are in µm",
+        )
     return rounded_up(room * bright, WAVES), rounded_up(room * faint, FAINT)
 
 

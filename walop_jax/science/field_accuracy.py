@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from walop_jax.calibration.accuracy import (
     GOAL,
+    LARGEST_P,
     NODES,
     SHARE,
     SIZE,
@@ -110,7 +111,7 @@ class FieldAccuracy:
         if self.without_u > 1.0 - SHARE and self.median <= allowed:
             strip = f"the strip without u ({100 * self.without_u:.0f} % of the field)"
             advice = f"observe {strip} with the plate at 22.5° as well"
-        if np.isnan(self.reached):
+        if not self.reached < LARGEST_P:  # not known, or as large as what is to be measured
             advice = "no single exposure measures both q and u: observe with the plate at 22.5° as well"
         asked.append(_p_known(self.reached, allowed, self.field_measured, advice, needed=False))
         if self.hidden > 0:
@@ -225,7 +226,7 @@ def known_in_half(error: float, goal: float = GOAL, cause: str = "") -> Requirem
     light = two_digits((error / allowed) ** 2)  # errors fall with its square root
     source = f" (most of the error comes from {cause})" if cause else ""
     advice = f"{light} times the light{source}, over several nights: walop-jax stack, walop-jax plan"
-    if not np.isfinite(error):
+    if not error < LARGEST_P:  # not known, or as large as what is to be measured: light alone does not help
         advice = (
             "observe with the calibration plate at 22.5° as well: elsewhere one exposure does not measure u"
         )
