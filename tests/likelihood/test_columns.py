@@ -159,6 +159,43 @@ def test_sentences_against_finite_differences(laid, text):
     _alike(columns(likelihood, values, [_said(text)]), difference[:, None], [text], 1e-5)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["WALOP-SOUTH", "WALOP-NORTH", "WALOP-LAB"])
+def test_every_kind_and_every_place_against_finite_differences(name):
+    """Residuals of a model that has one change of each kind and one at each place, with a little of one, and without.
+
+    A change stands alone where it may stand alone, and under one law where it may not.
+    """
+    plan = dataclasses.replace(WITH_PLATE, instrument=name)
+    calset, truth = simulate(plan, seed=4, noiseless=True)
+    model = base_model(calset)
+    every = grammar.descriptions(model.template, calset.exposures, len(calset.points))
+    known, texts = set[str](), list[str]()
+    for text in sorted((text for probe in every for text in texts_of(probe)), key=lambda t: t.count("*")):
+        change = Sentence.parsed(text)
+        if new := {change.kind, f"{change.relation} {change.place}"} - known:
+            known |= new
+            texts.append(text)
+    context = effect_context(model.template, calset.exposures)
+    whole = with_effects(model, [Described.saying(texts, [0.0] * len(texts))], context)
+    start = dict(zip(model.names, values_of(truth), strict=True))
+    values = np.array([start.get(p.name, p.start) for p in whole.parameters])
+    likelihood, step = Likelihood.of(calset, whole), 1e-4
+
+    def residuals(text: str, size: float) -> np.ndarray:
+        amplitude = whole.index(f"described.{Sentence.parsed(text).label}")
+        moved = np.where(np.arange(len(values)) == amplitude, size, values)
+        return likelihood.residuals(moved)[1][likelihood.used].reshape(-1)
+
+    theirs = np.transpose([(residuals(text, step) - residuals(text, -step)) / (2.0 * step) for text in texts])
+    given = np.array([start[parameter] for parameter in model.names])
+    ours = columns(Likelihood.of(calset, model), given, [_said(text) for text in texts])
+    off, length = (np.linalg.norm(of, axis=0) for of in (ours - theirs, ours))
+    # Of some changes the data hold little or nothing: differences of residuals are rounded to 10⁻¹² of a hundred σ.
+    assert np.all(off < 1e-5 * length + 1e-6), dict(zip(texts, off / length, strict=True))
+    assert np.sum(length > 0.1) > 25
+
+
 def test_by_hand():
     """A gain of one camera: w F N of that camera, less its part along the counts of all.
 

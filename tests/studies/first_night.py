@@ -8,7 +8,7 @@ set of few field points is simulated for each, changed as the mistake changes it
 the reason with which the data are refused, or what the headline of the diagnosis says was found. Printed are, for each,
 whether that is right, CPU seconds, χ²/dof of the set as it stands and with the cause, and the sentence. All run in one
 process: the first mistakes of an instrument hold the compilation of the programs that later ones share. With `--number`
-a number of `diagnosis.thresholds` has another value.
+a number of `diagnosis.thresholds` has another value; it may be given several times.
 """
 
 from __future__ import annotations
@@ -470,11 +470,11 @@ def main() -> int:
     parser.add_argument("--further", action="store_true", help="others of South in place of the forty")
     parser.add_argument("--seed", type=int, default=61)
     parser.add_argument("--seconds", type=float, default=150, help="CPU s after which one is given up")
-    parser.add_argument("--number", default="", help="NAME=VALUE of a threshold")
+    parser.add_argument("--number", action="append", default=[], help="NAME=VALUE of a threshold")
     options = parser.parse_args()
     switch_on()
-    if options.number:
-        number, _, value = options.number.partition("=")
+    for given in options.number:
+        number, _, value = given.partition("=")
         assert hasattr(thresholds, number), number
         setattr(thresholds, number, float(value))
 

@@ -61,13 +61,13 @@ def with_errors_held(likelihood: Likelihood, examined: Callable[[FitResult], Exa
     return held
 
 
-def held_closer(examination: Examination, model: Model) -> Model | None:
+def held_closer(examination: Examination, free: FitResult, model: Model) -> Model | None:
     """The model with its free errors held at what is left once additions were found.
 
     A far effect has no linear step that explains it: before it is found, it makes the errors too large. They are those
-    of a fit with the additions; if that takes something for noise, so that variances grow by more than
-    `thresholds.UNEVEN` in the mean, those behind all candidates. None where they are the same as before, or where
-    nothing is free.
+    of `free`, the fit with the additions and free errors; if that takes something for noise, so that variances grow by
+    more than `thresholds.UNEVEN` in the mean, they are those behind all candidates. None where they are the same as
+    before, or where nothing is free.
     """
     if not fits_errors(model):
         return None
@@ -82,7 +82,7 @@ def held_closer(examination: Examination, model: Model) -> Model | None:
         old, new = (variance_ratio(noise, terms, counts, weight) for noise in (before, after))
         return np.log(new / old)[weight > 0]
 
-    most, free = np.log1p(thresholds.UNEVEN), with_errors_free(result, model)
+    most = np.log1p(thresholds.UNEVEN)
     values = free.values[[free.model.index(name) for name in _names(model)]]
     held = _held(model, np.abs(values))
     if grown(held).mean() > most:

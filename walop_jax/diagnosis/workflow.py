@@ -117,15 +117,17 @@ def diagnose(
     quiet = dataclasses.replace(judge, tell=lambda text: None)
     held = with_errors_held(Likelihood.of(sample, model), quiet.examined)
     found = _searched(fit(Likelihood.of(sample, held)), judge, causes, structural, as_written=as_written)
-    if found.state.steps and (better := held_closer(found.state.evidence, model)) is not None:
+    free = with_errors_free(found.state.evidence.result, model)
+    if found.state.steps and (better := held_closer(found.state.evidence, free, model)) is not None:
         tell(Stage("errors of the data are better known with what was found: once more", "scoring"))
         found = _searched(
             fit(Likelihood.of(sample, better)), judge, causes, structural, as_written=as_written
         )
+        free = with_errors_free(found.state.evidence.result, model)
     before, first, state, remainder, conditions, judge = found
     del found  # it holds the columns of all candidates
     if fits_errors(model) and remainder is None:  # else what is left would be taken for noise
-        state = judge.adopt(state, with_errors_free(state.evidence.result, model), state.steps)
+        state = judge.adopt(state, free, state.steps)
         before = before if state.steps else state.evidence.result
     after, evidence, added = state.evidence.result, state.evidence, [step.effect.name for step in state.steps]
     steps = tuple(_finished(step, evidence, added) for step in state.steps)
