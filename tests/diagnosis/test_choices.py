@@ -80,7 +80,7 @@ def test_a_change_that_gained_nothing_is_not_compared_again(south, monkeypatch):
     monkeypatch.setattr(exact, "_screened", lambda result, asked: iter(()))
     result = Mock(FitResult, model=Mock(Model, template=south, effect_names=()))
     earlier = {change: Choice(change, 2.0, -5.0) for change in alternatives(south)}
-    asked = result, lambda: True, told.append
+    asked = result, lambda count: True, told.append
     assert other_descriptions(*asked, earlier=earlier) == ([], {})
     assert not told
     earlier |= {TURNED: Choice(TURNED, 2.0, 30.0), REVERSED: Choice(REVERSED, 0.5)}
@@ -105,7 +105,7 @@ def fitted(plan, change: str, seed: int = 5) -> FitResult:
 
 def best_of(result: FitResult) -> Choice | None:
     """The change that gains most in χ²."""
-    trials, tried = other_descriptions(result, lambda: True, lambda text: None)
+    trials, tried = other_descriptions(result, lambda count: True, lambda text: None)
     assert all(trial.instance.change in tried for trial in trials)
     fitted_ones = [one for one in tried.values() if np.isfinite(one.better_by)]
     return max(fitted_ones, key=lambda one: one.better_by, default=None)

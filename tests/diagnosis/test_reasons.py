@@ -80,8 +80,8 @@ def test_the_answer_has_the_numbers(name, told):
 
 def test_where_nothing_was_missing_it_says_so():
     quiet = FOUND | {"verdict": "consistent", "p_value": 0.37, "steps": [], "rounds": []}
-    assert "nothing was tried: of all patterns together p = 0.37" in why(quiet, "ghost")
-    assert "nothing was tried: of all patterns together p = 0.37" in why(quiet, "gain of O1 * x")
+    assert "nothing was tried: of all candidates together p = 0.37" in why(quiet, "ghost")
+    assert "nothing was tried: of all candidates together p = 0.37" in why(quiet, "gain of O1 * x")
 
 
 def test_a_fit_without_evidence_is_told_without_a_number():

@@ -347,19 +347,20 @@ def test_noise_asks_for_no_other_conditions(seed):
 def test_at_its_limit_a_number_is_found_as_often_as_promised():
     """Noise drawn into the fitted model, with the number wrong by its limit: 99 of 100 are found, at half of it few."""
     design = Design.of(small_fit())
-    limits = {one.what: one for one in condition_limits(design)}
+    singles = Singles.of(design)
+    limits = {one.what: one for one in condition_limits(design, singles)}
     rng = np.random.default_rng(5)
     rows = design.rows
     noise = np.zeros((len(design.residual), 1500))
     noise[:rows] = rng.standard_normal((rows, noise.shape[1]))
     checked = 0
-    scored = condition_scores(design)
-    tried = len(scored.testable)
+    # The verdict corrects for all single numbers: priors, terms of cameras and effects as well.
+    tried = len(singles.testable)
     least = 1.0 - (1.0 - 0.0027) ** (1.0 / tried)
-    for item in scored.items:
-        limit = limits[item.stated.what]
-        if not item.score.testable:
+    for item in singles.items:
+        if item.single.stated is None or not item.score.testable:
             continue
+        limit = limits[item.stated.what]
         left = design.projector(item.single.candidate.columns[:, 0])
         along = left @ design.projector(noise) / np.linalg.norm(left)
         for share, expected in ((1.0, thresholds.PROBABILITY), (0.5, 0.5)):
@@ -377,7 +378,8 @@ def test_a_limit_beyond_what_is_plausible_is_told_beside_the_error_of_the_plausi
     """The limit is that of the data; q and u are off by no more than the error that the set states makes."""
     limits = {}
     for position in (1.0, 2.0, 3600.0):
-        found = condition_limits(Design.of(small_fit_stating(position=position)))
+        design = Design.of(small_fit_stating(position=position))
+        found = condition_limits(design, Singles.of(design))
         limits[position] = next(one for one in found if one.what.startswith("X of all"))
     assert limits[1.0].detected == limits[2.0].detected == limits[3600.0].detected == limits[3600.0].size
     assert (limits[1.0].size, limits[2.0].size) == pytest.approx((1 / 3600, 2 / 3600))

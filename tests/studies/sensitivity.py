@@ -3,7 +3,9 @@
 Each number is taken smaller and larger.
 
     python tests/studies/benchmark/generate.py NEW --seed 3 --new
-    python tests/studies/sensitivity.py NEW --seed 3 [--each 1] [--quiet 12] [--pairs 12]          (ten minutes)
+    python tests/studies/sensitivity.py NEW --seed 3 [--each 1] [--quiet 12] [--pairs 12] [--only FAINTEST]
+
+Each value of a number takes five minutes; `--only` is an expression that names of numbers must hold.
 
 The scenes of NEW have another simulated run than the published ones, other noise, and shapes that are nowhere else
 (`benchmark/new_shapes.py`). Of each shape and ratio `--each` scenes are taken, `--quiet` in which nothing is hidden,
@@ -14,6 +16,7 @@ and those that are better and worse with the number as it is: right or in its cl
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 from collections import Counter
 from pathlib import Path
@@ -48,7 +51,7 @@ OTHERS = {
     "FLOOR": (1.1, 1.5),
 }
 """A smaller and a larger value of each."""
-REBUILT = {(score, "FAINTEST"): (0.01, 0.2), (thresholds, "COMMON_MODE"): (0.02, 0.1)}
+REBUILT = {(score, "FAINTEST"): (0.01, 0.3), (thresholds, "COMMON_MODE"): (0.02, 0.1)}
 """The same of numbers that are in the table of scores already: it is made again with each value."""
 
 
@@ -129,7 +132,7 @@ def changed(
 
 def main() -> None:
     """Print the table."""
-    parser = options_of(__doc__, each=1, quiet=12, pairs=12, seed=3)
+    parser = options_of(__doc__, each=1, quiet=12, pairs=12, seed=3, only="")
     parser.add_argument("folder", type=Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -138,9 +141,13 @@ def main() -> None:
     print(Counter(one["outcome"] for one in scenes.as_they_are.values()))
     print("| number | smaller: changed; better; worse with it | larger |\n| --- | --- | --- |")
     for name, values in OTHERS.items():
+        if not re.search(options.only, name):
+            continue
         cells = [f"{value:g}: {'; '.join(map(str, changed(scenes, name, value)))}" for value in values]
         print(f"| `thresholds.{name}` | {cells[0]} | {cells[1]} |", flush=True)
     for (module, name), values in REBUILT.items():
+        if not re.search(options.only, name):
+            continue
         told = [changed(scenes, name, value, module, rebuilt=True) for value in values]
         cells = [f"{value:g}: {'; '.join(map(str, of))}" for value, of in zip(values, told, strict=True)]
         print(f"| `{module.__name__.rpartition('.')[2]}.{name}` | {cells[0]} | {cells[1]} |", flush=True)

@@ -4,8 +4,8 @@ Additions    effects with a name, and groups of descriptions. The class of an ad
              that could take its place and would not be improbable there (`thresholds.IMPROBABLE`), by one linear step.
              Their prior probabilities are equal: a name does not make a candidate more probable.
 One step     A model without some amplitudes a leaves r + D of the residuals r, D = −J_a a. Other columns K take their
-             place with b = −(KᵀPK)⁺ KᵀP(r + D), and all other parameters move by −J_o⁺ (D + K b), where P projects off
-             the other columns J_o. Exact where everything is linear.
+             place with b = −(KᵀPK + W⁻²)⁻¹ KᵀP(r + D), W their prior widths, and all other parameters move by
+             −J_o⁺ (D + K b), where P projects off the other columns J_o. Exact where everything is linear.
 Kinds        An effect in exposures of one KIND is a difference between that KIND and all others; residuals do not
              show which of the two is wrong. "In all other kinds, with the other sign" is an equally probable member.
              Ahead of the polariser there is no such change, as exposures through it would not show it: then "in KIND
@@ -33,7 +33,7 @@ from walop_jax.calibration.accuracy import measures_u, p_errors, sample_stars
 from walop_jax.calibration.matrix import first_setting, matrix_slopes, of_matrix
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.class_product import Answer, OpenQuestion, WeightedChanges, changes_in, distinct
-from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, signature
+from walop_jax.diagnosis.exact import amplitude_positions, beyond_prior, context_of, prior_width, signature
 from walop_jax.diagnosis.examination import Examination, follow_physics
 from walop_jax.diagnosis.hypotheses import texts_of
 from walop_jax.diagnosis.score import FAINTEST, best_scale, log_bayes
@@ -238,7 +238,7 @@ class LinearStep:
         column[design.rows :] = 0.0  # without its prior, which enters through the widths
         projected = self.projector(column)
         parameters = [fit.model.parameters[i] for i in positions.tolist()]
-        widths = np.array([p.scale if p.prior is None else p.prior[1] for p in parameters])
+        widths = np.array([prior_width(parameter) for parameter in parameters])
         evidence = log_bayes(projected.T @ projected, projected.T @ self.left, widths) / scatter**2
         return Answer(name, evidence, sums, np.zeros_like(self.laid.matrix)), widths
 
@@ -295,15 +295,18 @@ class LinearStep:
     ) -> list[tuple[Answer, bool]]:
         """Members of the class of a smooth field: others that would not be improbable in its place.
 
-        They are listed as `candidates` lists others. Beside the model without the addition the Gram matrix of a field
-        is that beside the model with it, and the part of its columns along those of the addition.
+        Each comes with True, as one of `alike` in `candidates`. Once the addition is out of the model, the Gram matrix
+        of a field is the one beside the addition plus the products of its columns with the basis of the addition.
         """
         texts = (*_texts(addition.sums), *whole)
         names = {Change.parsed(text).candidate for text in texts if " * field " in text}
         smooth, design = self.laid.state.smooth if names else None, self.laid.design
         if smooth is None:
             return []
-        along, scores = smooth.products(self.basis), smooth.products(self.left[:, None])[:, 0]
+        along, disturbances = smooth.products(self.basis), smooth.bases[1]
+        # Behind what single exposures take up, as the Gram matrices are.
+        left = self.left - disturbances @ (disturbances.T @ self.left)
+        scores = smooth.products(left[:, None])[:, 0]
         laid = dict[str, tuple[AnyMatrix, AnyVector, AnyVector]]()  # Gram matrix, scores, prior widths
         for (name, at), gram in zip(smooth.places.items(), smooth.grams, strict=True):
             laid[name] = gram + along[at] @ along[at].T, scores[at], smooth.widths_of(name)
@@ -379,7 +382,7 @@ class LinearStep:
         name = "; ".join(description.text for description in changes_in(sums))
         twin = self.member(name, sums, column, widths)
         # It is the same difference between KINDs, told from the other side: as probable, whatever the throughputs are.
-        alike = max(thresholds.EVEN_ODDS, thresholds.LINEAR * abs(member.evidence))
+        alike = max(thresholds.CERTAIN_ODDS, thresholds.LINEAR * abs(member.evidence))
         near = abs(twin.evidence - member.evidence) < alike
         return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
 

@@ -13,9 +13,9 @@ Model        that of the fit with the changes of all members of all questions. A
              follow as for any other calibration. Members with the same effect on the result count once. Deviations and
              undetected changes are hundreds: those that act on starlight are the effect `deviations`. Their mean is
              mostly noise; the product has the values of the fit, and their second moment E[c cᵀ] as covariance.
-Trust        Where the effects of members on stars differ by more than the goal, or by more than the errors of the fit,
-             only a class was identified and the product is not trusted: the ambiguity dominates the error. Likewise for
-             the error of p from deviations.
+Trust        Where the effects of members on stars differ by more than the goal, by more than the errors of the fit, or
+             by more than `thresholds.SEPARATION` errors of an element of the matrix, only a class was identified and
+             the product is not trusted: the ambiguity dominates the error. Likewise for the error of p from deviations.
 Limits       to first order.
 """
 
@@ -92,8 +92,9 @@ class OpenQuestion(NamedTuple):
 
     `about` is the addition of a class, which is its first member, with the positions `at` of its amplitudes among the
     free parameters; of other questions it is in words. `spread` is the error of p of stars between members, `stated`
-    that of the fit, medians over the field; `off` by how many errors of the product the farthest member lies from it,
-    in the median of the field, the worst element. The changes of its members are in the effect `effect` of the product.
+    that of the fit, medians over the field; `off` by how many errors of the product the farthest member lies
+    from it, of those above a probability of 1 − `thresholds.CERTAIN`: median over the field, worst element. The changes
+    of its members are in the effect `effect` of the product.
     """
 
     about: str
@@ -369,7 +370,7 @@ def distinct(
 
 
 def _dominates(spread: float, stated: float) -> bool:
-    """True if an ambiguity is larger than the goal, or than the errors of the fit."""
+    """True if an ambiguity is larger than the goal, or than both the errors of the fit and `thresholds.NEGLIGIBLE`."""
     return spread > min(GOAL, max(stated, thresholds.NEGLIGIBLE))
 
 

@@ -10,8 +10,9 @@ Named       A rival that does its best to follow the effect stays √S ε from i
             with `thresholds.PROBABILITY`: ε ≥ d/√S + z/√G with d that separation; below it is reported with those for
             which it may be taken.
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
-            m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected is the
-            largest error of q and u that the effect can make without being noticed. On the map each effect has a
+            m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected, or
+            at its prior width where this is smaller, is the largest error of q and u that the effect can make without
+            being noticed. On the map each effect has a
             tenth on top (`SECOND_ORDER`): scattered light that is just detected does up to 8 % more than this. What
             could hide, in a sentence and in the table, is that of `calibration.could_hide`, as for any calibration.
 
@@ -45,7 +46,7 @@ from walop_jax.diagnosis.examination import Examination, examine, most_points, s
 from walop_jax.diagnosis.grammar import hypotheses
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import ScoreSpace, local_p, noncentrality, separations
-from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
+from walop_jax.diagnosis.stated_conditions import Singles
 from walop_jax.diagnosis.trust import sampled
 from walop_jax.diagnosis.undetected_errors import Starlight, undetected_errors
 from walop_jax.fit.refit import FitResult
@@ -73,8 +74,8 @@ class DetectionLimit(NamedTuple):
     `detected` holds the smallest and the largest over the shapes that the effect may have, `named` the largest
     (infinite where some rival does exactly the same). `taken_for` are the effects for which it may be taken when it is
     just detected, nearest first. `error_of_qu` is the error that q and u of a star polarised by up to 5 % have from it
-    at the amplitude that is just detected: median and largest over the field; NaN where one exposure does not give
-    both.
+    at the amplitude that is just detected, or at its prior width if this is smaller: median and largest over the field;
+    NaN where one exposure does not give both.
     """
 
     effect: str
@@ -319,13 +320,14 @@ def detection_limits(
     tell(Stage("finding what goes unnoticed", "unnoticed"))
     errors = _errors(examination, columns)
     design = examination.design
+    singles = Singles.of(design)
     if (hidden := result.hidden) is None:
-        hidden = undetected_errors(design, Singles.of(design))
+        hidden = undetected_errors(design, singles)
     examined = result if result.verdict is not None else result.with_verdict()
     calibration = Calibration.from_fit(dataclasses.replace(examined, hidden=hidden))
     limits = _collected(examination, columns, errors, listed.effects, calibration)
     return dataclasses.replace(
-        limits, conditions=condition_limits(design), could_hide=could_hide(calibration)
+        limits, conditions=condition_limits(design, singles), could_hide=could_hide(calibration)
     )
 
 
@@ -369,7 +371,7 @@ def _columns(examination: Examination, rivals: ScoreSpace, probe: Probe, p: floa
 def _errors(examination: Examination, columns: Sequence[_Column]) -> Float[np.ndarray, "c p"]:
     """Error of q and u at every field point from each column, at the amplitude that is just detected.
 
-    It is at most the width of its prior: the plausible size where the detection limit is larger.
+    That amplitude is at most its prior width: the plausible size where the detection limit is larger.
     Of an effect with many shapes that of the median amplitude stands for all; the others are NaN.
     """
     design, calset, chosen = examination.design, examination.result.calset, _representative(columns)
@@ -460,23 +462,24 @@ def _collected(
 # --------------------------------------------------------------------------------------------------- stated conditions
 
 
-def condition_limits(design: Design) -> tuple[ConditionLimit, ...]:
-    """A limit for every stated condition of the set behind a fit."""
-    scored = condition_scores(design)
-    tried = len(scored.testable)
-    if not tried:
+def condition_limits(design: Design, singles: Singles) -> tuple[ConditionLimit, ...]:
+    """A limit for every number that the set behind a fit states, of all `singles` that its verdict asks.
+
+    A number is found where it is significant among all of them, as in the verdict.
+    """
+    tried, scored = len(singles.testable), [one for one in singles.items if one.single.stated is not None]
+    if not scored:
         return ()
-    columns = np.column_stack([item.single.candidate.columns[:, 0] for item in scored.items])
+    columns = np.column_stack([item.single.candidate.columns[:, 0] for item in scored])
     taken_up = design.projector.taken_up(design.projector.basis.T @ columns)
     moved = design.fit.model.selection() @ taken_up
     stars = Starlight.everywhere(design, ())
     least = noncentrality(local_p(thresholds.ALARM, tried), 1, thresholds.PROBABILITY)
-    # Of errors as stated, not of the residuals: a plan has none.
+    # In errors of the fit, not in the scatter of its residuals: a plan has none.
     detected = [
-        float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf
-        for item in scored.items
+        float(np.sqrt(least / float(item.rest[0]))) if item.score.testable else np.inf for item in scored
     ]
-    every = [item.stated for item in scored.items]
+    every = [item.stated for item in scored]
     sizes = np.array([min(found, stated.error) for found, stated in zip(detected, every, strict=True)])
     changes = [
         size * stars.slope_by_number(stated) if stated.seen_by_stars else 0.0

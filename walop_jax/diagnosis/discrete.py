@@ -99,9 +99,10 @@ def causes(
     *,
     descriptions: bool = False,
 ) -> tuple[Alternative, ...]:
-    """The causes that explain a set, best first, where a fit misses it by a per cent or more.
+    """The causes that explain a set, best first; none if χ²/dof of its fit is below `thresholds.POOR_FIT`.
 
-    `left` is the χ²/dof of a fit of `model`; the others are those of `causes_of`.
+    Where no exposure misses a per cent of its light only readings of some exposures are asked. `left` is the χ²/dof of
+    a fit of `model`; the other arguments are those of `causes_of`.
     """
     if left < thresholds.POOR_FIT:
         return ()
@@ -155,7 +156,6 @@ def _compared(
     of_all = list(readings(few, model))
     # Readings of some exposures and of the whole set compete: they may do the same to all data that there are.
     of_data = [*of_some, *of_all]
-    # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
     if left < FAR_OFF:
         # Nearer by, names compete: only what leaves noise is told, and what has a size is for the search.
         return look.first_of(
@@ -166,6 +166,7 @@ def _compared(
         return found
     if descriptions and (found := _stated_otherwise(likelihood, left, values)):
         return found
+    # With a choice of exposures, or a size, much can be imitated: only what leaves noise is told.
     if found := look.first_of([lambda: look.screen.in_parts(of_all), look.screen.steps], NEARLY):
         return found
     tell("comparing two mistakes of the data at once")
@@ -291,9 +292,9 @@ class _Look:
             return ()
         place, least = {item.what: n for n, item in enumerate(items)}, good[0].explained
         alike = [item for item in good if item.explained < thresholds.POOR_FIT * least]
-        # Within an odds ratio of e³ the data do not say which: the commoner one is listed first.
+        # Within `thresholds.CERTAIN_ODDS` the data do not say which it is: the commoner one is listed first.
         free = max(self.likelihood.used_data.n_data, 1)
-        equal = least + 2.0 * thresholds.EVEN_ODDS / free
+        equal = least + 2.0 * thresholds.CERTAIN_ODDS / free
         return tuple(
             sorted(
                 alike,

@@ -12,7 +12,7 @@ Other descriptions of the instrument are tried where a fit explains nothing:
    description, priors included. Nothing is fitted; a sample of the field points is enough.
 2. The few changes that leave least are fitted together with all parameters. Other curves of dispersion are always
    fitted: plates change their thickness to make up for a wrong curve, which one step cannot show. The evidence of a
-   change against the given description is half its gain in χ² less the logarithm of the number of changes compared.
+   change against the given description is that of its fit (above) less the logarithm of the number of all such changes.
 3. A change that gained nothing is not compared again once names have joined the model: the names explain a part of the
    misfit, and leave less for the change to explain.
 """
@@ -41,7 +41,7 @@ from walop_jax.model.alternatives import JOINED, alternatives, changed, other_cu
 from walop_jax.model.effects import Context, Described, Effect, EffectKind, OtherDescription
 from walop_jax.model.effects.in_models import effect_context, model_without, with_descriptions, with_effects
 from walop_jax.model.light_path import NoSuchPlaceError
-from walop_jax.model.parameters import leaves, values_of
+from walop_jax.model.parameters import Parameter, leaves, values_of
 from walop_jax.model.specification import Model
 
 
@@ -109,18 +109,21 @@ class Trial:
         return self.instance.sentences  # type: ignore[attr-defined]
 
 
+def prior_width(parameter: Parameter) -> float:
+    """The width of the prior of a parameter; without a prior that of its weak pull, or its `scale`."""
+    return parameter.prior[1] if parameter.prior is not None else (parameter.loose or parameter.scale)
+
+
 def log_evidence_ratio(
     base: FitResult, extended: FitResult, scales: Float[np.ndarray, " t"] = SCALES
 ) -> float:
-    """Laplace evidence of an extended fit against the base (parameters without a prior carry no Occam factor).
+    """Laplace evidence of an extended fit against the base.
 
-    Amplitudes are averaged over all `scales` of their prior widths.
+    Amplitudes are averaged over all `scales` of their prior widths (`prior_width`).
     """
     base_names, model = set(base.model.names), extended.model
     widths = [
-        p.prior[1] if p.prior is not None else (p.loose or p.scale)
-        for p in model.parameters
-        if p.name not in base_names and p.free and p.tie is None
+        prior_width(p) for p in model.parameters if p.name not in base_names and p.free and p.tie is None
     ]
     amplitudes = [i for effect in model.effect_names for i in amplitude_positions(model, effect)]
     at = [i for i in amplitudes if model.names[i] not in base_names]
@@ -204,7 +207,7 @@ def try_shapes(base: FitResult, item: Ranked, shapes: int) -> Trial:
     trials = [try_effect(base, step, shapes) for step in steps]
     converged = [t for t in trials if t.fit is not None and t.fit.converged]
     best = max(converged or trials[:1], key=lambda t: t.evidence)
-    alike = [t for t in converged if t.evidence > best.evidence - thresholds.EVEN_ODDS]
+    alike = [t for t in converged if t.evidence > best.evidence - thresholds.CERTAIN_ODDS]
     alternatives = dict.fromkeys(in_words(t.instance) for t in alike if _differ(t, best))
     return dataclasses.replace(best, alternatives=tuple(alternatives))
 
@@ -328,7 +331,7 @@ def described_otherwise(model: Model, sentence: str, calset: CalibrationSet) -> 
 
 def other_descriptions(
     result: FitResult,
-    fits: Callable[[], bool],
+    allowed: Callable[[int], bool],
     tell: Callable[[str], None],
     *,
     all_of_them: bool = True,
@@ -336,7 +339,8 @@ def other_descriptions(
 ) -> tuple[list[Trial], dict[str, Choice]]:
     """Fits of other descriptions of the instrument, and all comparisons (`Choice`) by the text of the change.
 
-    All changes are compared, and the best of them fitted as long as `fits()` is true. `earlier` are comparisons made
+    All changes are compared, and the best of them fitted as long as `allowed` is true of the number of fits so far.
+    `earlier` are comparisons made
     before the last names joined the model.
     """
     template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
@@ -351,14 +355,14 @@ def other_descriptions(
     if not asked:
         return [], {}
     tell(f"comparing {len(asked)} other descriptions")
-    candidates = itertools.takewhile(lambda _: fits(), asked)
+    candidates = itertools.takewhile(lambda _: allowed(0), asked)
     screened = sorted(_screened(result, candidates), key=lambda item: item[0].left)
     compared, trials = {choice.change: choice for choice, _, _ in screened}, []
     best = [item for item in screened if item[1] > thresholds.LEAST_GAIN][: thresholds.MOST_FITTED]
     chosen = {choice.change for choice, _, _ in best}
     others = [item for item in screened if item[0].change in curves and item[0].change not in chosen]
     for choice, _, start in (*best, *others):
-        if not fits():
+        if not allowed(len(trials)):
             break
         tell(f"trying another description: {choice.change}")
         model = described_otherwise(result.model, choice.change, result.calset)

@@ -71,7 +71,8 @@ def shortest(item: Ranked) -> Described:
         return log_bayes(information[np.ix_(indices, indices)], scores[indices], widths[indices])
 
     subset, most = list(range(len(widths))), thresholds.MOST_TOGETHER
-    subsets = [list(indices) for n in subset for indices in itertools.combinations(subset, n + 1) if n < most]
+    sizes = range(1, min(len(subset), most) + 1)
+    subsets = [list(indices) for size in sizes for indices in itertools.combinations(subset, size)]
     while len(subset) > most:
         subsets.append(subset)
         subset = max(([i for i in subset if i != index] for index in subset), key=worth)
@@ -167,7 +168,7 @@ class Evidence:
 
     @property
     def scatter(self) -> float:
-        """Scatter behind all candidates, in standard deviations of the data as stated; 1 or more.
+        """Scatter behind all candidates, in errors of the fit (N_ERR times `FitResult.noise_scale`); 1 or more.
 
         Above `thresholds.FLOOR` no candidate explains the data to within N_ERR. Evidence and separations then count in
         this unit: in that of photons everything would be certain.
@@ -177,7 +178,8 @@ class Evidence:
     def by_fit(self, score: Score) -> float:
         """What a fit of this candidate finds as ln B, less its ln B by the linear step.
 
-        Fits count in errors as stated, linear steps in units of the scatter behind all candidates (`noise_scale`).
+        Fits count in the errors of the fit that is examined, linear steps in units of the scatter behind all
+        candidates (`ScoreTable.noise_scale`).
         """
         return 0.5 * score.statistic * (self.table.noise_scale**2 - 1.0)
 
@@ -323,6 +325,10 @@ class Examination(Evidence):
         columns = self.design.stacked([self.candidates[SINGLE_EXPOSURES].columns[:, place - first]])
         return self.design.projector(columns) @ w
 
+    def knows(self, name: str) -> bool:
+        """True if a name is that of a candidate or of a smooth field."""
+        return name in self.candidates or (self.smooth is not None and name in self.smooth.names)
+
     def candidate(self, name: str) -> Candidate:
         """A candidate or a smooth field, with its columns."""
         if name in self.candidates or self.smooth is None:
@@ -375,7 +381,7 @@ class Examination(Evidence):
         return {rival: apart / self.scatter for rival, apart in distances.items()}
 
     def is_like(self, design: Design) -> bool:
-        """True if the expected counts of another fit are close enough to reuse its columns."""
+        """True if another fit expects nearly the same counts, so that the columns of this one serve it as well."""
         ours, theirs = (of.measured.counts_changed_by(GAIN) for of in (self.design, design))
         return bool(np.linalg.norm(ours - theirs) < thresholds.LINEAR * np.linalg.norm(ours))
 

@@ -186,7 +186,7 @@ class Step(FitComparison):
     errors stated. `choices` are discrete (which camera, which star), `alternatives` other shapes of the same effect
     that explain the data as well. `equivalent` are the effects indistinguishable from it in this data set, `separation`
     is the distance (σ) of each rival from it. `descriptions` are those of an effect without a name
-    (`described`) with amplitude and error, `nameless` those that are not improbable in addition to what was found.
+    (`described`) with amplitude and error, `nameless` descriptions that it may be instead.
     `also_called` are other names of it and of those, by name (`synonyms`). `about` is the effect in words with its
     place, `probability` that of its name among all names of the list, given that one of them is true (NaN: unknown).
     """

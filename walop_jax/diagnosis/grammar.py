@@ -320,7 +320,7 @@ def starts_of_steps(exposures: Exposures) -> Float[np.ndarray, " s"]:
 
 
 def evenly(times: Float[np.ndarray, " s"]) -> Float[np.ndarray, " t"]:
-    """`STEPS` or fewer of them that part the others evenly; `retimed` has those between."""
+    """`STEPS` or fewer of the times, evenly spread over their list; `retimed` tries the times between."""
     at = np.unique(((np.arange(STEPS) + 0.5) / STEPS * len(times)).astype(int))
     return times[at[: len(times)]]
 
@@ -411,7 +411,7 @@ class Dependences:
                 yield (f"side {prefix}",)
 
     def _moments(self) -> Float[np.ndarray, " s"]:
-        """Times at which something may have changed, of an element that it may have while it was inside the beam."""
+        """Times (hours) at which something may have changed: ahead of each exposure that is `inside` but the first."""
         if not varies(self.exposures.mjd):
             return np.zeros(0)
         starts, hours = starts_of_steps(self.exposures), np.unique(hours_of(self.exposures)[self.inside])
@@ -445,13 +445,13 @@ class Dependences:
         return [(hours[start], hours[stop - 1]) for start, stop in nights]
 
     def _kind(self) -> Iterator[tuple[str, ...]]:
-        """Kinds of exposures; of all exposures without the most frequent, beside which parameters hold the same."""
+        """KINDs of the exposures `inside`; if these are all exposures, without the most frequent (but `every_kind`)."""
         names, counts = np.unique(self.exposures.kind[self.inside], return_counts=True)
         first = int(len(names) == 1 or (bool(self.inside.all()) and not self.every_kind))
         yield from ((f"kind {name}",) for name in names[np.argsort(-counts, kind="stable")][first:])
 
     def _exposure(self) -> Iterator[tuple[str, ...]]:
-        """Every single exposure, where there are enough field points."""
+        """Every single exposure, of up to `limits.FREE_EXPOSURES`, where there are enough field points."""
         if self.over_field and len(self.exposures) <= limits.FREE_EXPOSURES:
             yield from ((f"exposure {number}",) for number in np.flatnonzero(self.inside))
 

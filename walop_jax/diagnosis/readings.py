@@ -277,9 +277,9 @@ def _dead(likelihood: Likelihood) -> Iterator[Alternative]:
     )
     for k in np.flatnonzero(dead.any(axis=0) & ~dead.all(axis=0)):
         off = exposures[dead[:, k]]
-        listed = some([str(number) for number in calset.exposures.exposure[off]], 6)
+        numbers = some([str(number) for number in calset.exposures.exposure[off]], _LISTED)
         yield Alternative(
-            f"exposures {listed} were left out, in which camera {model.template.cameras.names[k]} holds no light",
+            f"exposures {numbers} were left out, in which camera {model.template.cameras.names[k]} holds no light",
             "leave them out, or reduce them again",
             with_block(lambda b, off=off: {"used": b.used & ~np.isin(np.arange(b.used.shape[1]), off)}),
         )

@@ -80,7 +80,7 @@ def _of_the_rounds(document: Document, name: str) -> Iterator[str]:
         numbers = f"{worth} {how}, p {probability(entry['p_value'])}"
         yield f"round {number}: {numbers}: {entry['reason'] or 'added'}{added if entry['reason'] else ''}"
     if not rounds and name in scored:
-        yield f"nothing was tried: of all patterns together p {probability(document['p_value'])}, nothing is missing"
+        yield f"nothing was tried: of all candidates together p {probability(document['p_value'])}, nothing is missing"
 
 
 def _asked(turn: Document, name: str) -> Document | None:
@@ -104,7 +104,7 @@ def _of_a_description(document: Document, name: str) -> Iterator[str]:
     count, rounds = document.get("descriptions"), document.get("rounds", ())
     of = f"one of {count} descriptions" if count is not None else "a description"
     if not rounds:
-        yield f"{of}; nothing was tried: of all patterns together p {probability(document['p_value'])}"
+        yield f"{of}; nothing was tried: of all candidates together p {probability(document['p_value'])}"
         return
     yield (
         f"in none of {len(rounds)} rounds is it among those that were tried or listed: as {of} it was not significant "

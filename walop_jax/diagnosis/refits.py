@@ -122,8 +122,8 @@ class Refits:
         """
         result, trials = state.evidence.result, list[Trial]()
 
-        def allowed() -> bool:
-            return not self.over(state.fits + len(trials))
+        def allowed(further: int = 0) -> bool:
+            return not self.over(state.fits + len(trials) + further)
 
         for effect in self.hypotheses.effects if state.evidence.poor else ():
             if effect.is_structural() and effect.name not in result.model.effect_names and allowed():
@@ -228,7 +228,7 @@ def contradicting(before: Design, after: Design) -> str:
     if len(names) < 2:
         return ""
     first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    worse = (gains_of_units(kinds, first, second) < -thresholds.EVEN_ODDS).all(axis=0)
+    worse = (gains_of_units(kinds, first, second) < -thresholds.CERTAIN_ODDS).all(axis=0)
     return ", ".join(f"KIND {kind}" for kind in names[worse])
 
 

@@ -41,9 +41,9 @@ Remainder = tuple[State, Unexplained | None]
 def concluded(first: State, state: State, judge: Refits) -> Remainder:
     """The state without unneeded additions, and its unidentified remainder (None: nothing).
 
-    A model that predicts exposures worse than the first model is not adopted, with a free-form term or without. More
-    descriptions than `thresholds.MOST_SENTENCES` are taken as one cause that none of them describes; they become the
-    remainder.
+    A model that predicts exposures, or parts of the field, worse than the first model is not adopted. More descriptions
+    than `thresholds.MOST_SENTENCES` are reported as the remainder: one cause that none of them describes. They stay in
+    the model only if they predict data that they were not fitted to (`refits.predicts_unseen`).
     """
     state, remainder = _leftover(first, prune(first, state, judge), judge)
     adopted = state.steps or (remainder is not None and remainder.free_form)
@@ -57,9 +57,11 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
         return state, None
     text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())
-    columns = [first.evidence.candidate(name) for name in added]
-    if predicts_unseen(first.evidence.design, columns):
-        return state, remainder
+    # A place that only a structural effect has made is unknown to the first model.
+    if all(map(first.evidence.knows, added)):
+        terms = [first.evidence.candidate(name) for name in added]
+        if predicts_unseen(first.evidence.design, terms):
+            return state, remainder
     state = _without(first, state, [Described.name], judge)
     remainder = dataclasses.replace(remainder, p_value=state.evidence.table.p_global)
     return state, _and(remainder, _LEFT_OUT)
@@ -368,5 +370,5 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
             text += f" ({stated.remedy}; χ²/dof = {result.chi2 / max(result.dof, 1):.3g})"
             likely.append((worth, text, explained))
     likely.sort(reverse=True)
-    texts = [text for worth, text, _ in likely if worth > likely[0][0] - thresholds.EVEN_ODDS]
+    texts = [text for worth, text, _ in likely if worth > likely[0][0] - thresholds.CERTAIN_ODDS]
     return "; or ".join(texts), bool(likely) and likely[0][2]

@@ -114,6 +114,6 @@ def _of_rows(result: FitResult) -> Iterator[Remedy]:
 
 
 def _of_numbers(result: FitResult) -> Iterator[Remedy]:
-    """A number that the set states: no more than the data themselves are changed by it."""
+    """A number that the set states, if it alone leaves nothing but noise: `worth` 0, the mean of χ² − dof of noise."""
     if text := number_alone(result, condition_scores(Design.of(result))):
         yield Remedy(f"the residuals ask for {text}", 0.0)

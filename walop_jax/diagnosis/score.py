@@ -75,8 +75,8 @@ class Score:
     """The efficient score of one candidate.
 
     `statistic` T and `rank`; `log_p` ln of the local p; `amplitudes` one step from zero with `covariance`; `log_bayes`
-    the Laplace evidence against the base for the prior widths. A ghost of 0.3 % ± 0.1 % has one amplitude, 0.003, the
-    rank 1 and the statistic 9, the square of its three standard errors.
+    ln B against the base for the prior widths, exact (the function `log_bayes`). A ghost of 0.3 % ± 0.1 % has one
+    amplitude, 0.003, the rank 1 and the statistic 9, the square of its three standard errors.
     """
 
     name: str
@@ -116,7 +116,11 @@ class Projector:
 
 @dataclasses.dataclass(frozen=True)
 class ScoreTable:
-    """Scores of all candidates against one fit, and the global significance of the best of them."""
+    """Scores of all candidates against one fit, and the global significance of the best of them.
+
+    `noise_scale` is the scatter of the residuals behind base and candidates, in units of their errors; `trials` the
+    effective number of independent candidates.
+    """
 
     scores: tuple[Score, ...]
     noise_scale: float
@@ -242,7 +246,7 @@ class ScoreSpace:
 
     @functools.cached_property
     def alive(self) -> Bool[np.ndarray, " _"]:
-        """Amplitudes of which the base leaves something and that would stand out at a plausible size."""
+        """Amplitudes of which the base leaves something, and that reach `FAINTEST` σ at their prior width."""
         after = np.clip(self.gram.diagonal(), 0.0, None)
         share = np.where(self.before > 0, after / np.where(self.before > 0, self.before, 1.0), 0.0)
         return (share > ABSORBED) & (np.sqrt(after) * self.widths > FAINTEST)

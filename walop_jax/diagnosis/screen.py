@@ -308,9 +308,9 @@ def applied(item: Alternative, calset: CalibrationSet, model: Model) -> tuple[Ca
 
 
 def misfit_after(likelihood: Likelihood, before: float, steps: int) -> tuple[float, Vector]:
-    """χ²/dof after some steps, the errors of the data scaled as `before`, then as the step before, asks for; and where.
+    """The smallest χ²/dof at the start and after each of `steps` Gauss–Newton steps, and the values (n,) there.
 
-    The smallest of all steps, and the values there.
+    The errors of the data are scaled by the root of χ²/dof, 1 or more: first of `before`, then of the last expansion.
     """
     model, least = likelihood.model, before
     x = model.start[model.free]

@@ -1,15 +1,17 @@
 """The search for missing effects: while something is missing, the most probable name of it is fitted and added.
 
 1. `selection` says how many things are missing, and which names each of them may have, by linear steps from the fit.
-2. The names of the thing with the most evidence are fitted, the most probable first. That ends when the fit of a name
-   leaves it more probable than every name that is not fitted yet is by its linear step.
-3. Where the model is far off and no name explains half of the misfit, or where no name is left, changes that have no
-   derivative compete with the names: structural effects and other descriptions of the instrument (`Refits.others`).
+2. The names of the thing with the most evidence are fitted, the most probable first. That ends when a name
+   leaves nothing but noise, or is, by its fit, more probable than every name not fitted yet is by its linear step.
+3. Where the fit is poor (`Evidence.poor`) and no name explains all but a tenth of the misfit (`thresholds.PART`), or
+   where no name is left, changes that have no derivative compete with the names (`Refits.others`): structural effects
+   and other descriptions of the instrument; where the fit is not poor, other curves of dispersion alone.
 4. The most probable name that held-out data confirm joins the model, and the residuals are scored again. If no name of
    a thing is confirmed, the next thing is tried, unless the first one is best described by a pattern: a weaker thing
    would then be fitted to a model that lacks the stronger one, and imitate it.
 
-All is functions of a `State`, which never changes; `against` has all rules by which a name is not added. A `TrialJudge`
+All are functions of a `State`, which never changes. `against` has the rules by which a trial is refused; one more is
+that a pattern without a name is more probable (`_RoundInProgress._is_pattern`). A `TrialJudge`
 says what a name is worth: by exact fits (`refits.Refits`) or, in tests, by linear steps
 (`tests/diagnosis/linear_judge.py`).
 """
@@ -336,7 +338,7 @@ def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
 def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: Iterable[Probable]) -> Trial:
     """A trial with its rivals, and its probability among them.
 
-    Rivals are the other names in the set of its thing, and the names that passed with about the same probability.
+    Rivals are the other names in the set of its thing, and names that passed and are not improbable beside it.
     """
     worth = {other.name: probable for probable, other in passed}
     near = [name for name, value in worth.items() if value > worth[trial.name] - thresholds.IMPROBABLE]

@@ -78,7 +78,7 @@ class Thing:
 
     @property
     def is_pattern(self) -> bool:
-        """True if a pattern without a name is more probable than every name and every description."""
+        """True if the most probable candidate is a pattern: more probable than every single shape of a name."""
         return isinstance(self.candidate, str)
 
     @property

@@ -95,7 +95,7 @@ class SmoothFields:
 
     @cached_property
     def grams(self) -> list[AnyMatrix]:
-        """The Gram matrix of each candidate, behind the free parameters."""
+        """The Gram matrix of each candidate, behind the free parameters and the disturbances of single exposures."""
         taken = [self.products(basis) for basis in self.bases]
         return [
             square - sum((along[at] @ along[at].T for along in taken), np.zeros_like(square))

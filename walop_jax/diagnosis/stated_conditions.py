@@ -5,7 +5,7 @@ single number, and a fit takes most of it up in its own parameters, which are th
 χ² hardly changes. Patterns over field and exposures, of which there are hundreds, miss a misfit spread over all data.
 So each number has its own efficient score (`score`), with the derivative
 
-    C = [r(θ̂; set with c + h) − r(θ̂; set with c − h)] / 2h
+    C = [r(θ̂; set with c + h) − r(θ̂; set with c)] / h,   of field positions [r(c + h) − r(c − h)] / 2h
 
 of the whitened residuals r with respect to the number c that the set states, fluxes solved for anew. A row knows of the
 field only its own place, so that scale and angle are sums of X and Y, row by row.
@@ -51,7 +51,9 @@ _ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
 _PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capitaine et al. 2003, A&A 412, 567
 _J2000 = 51544.5  # MJD
-STEP = 1e-4  # of the width: the error of the derivative is its square
+STEP = (
+    1e-4  # of the width: a one-sided derivative is wrong by a share of this size, a central one by its square
+)
 
 
 class Stated(NamedTuple):
@@ -101,7 +103,7 @@ class Scored(NamedTuple):
     """A number, or a few of one thing, with the score of changing it.
 
     `along` (q, columns) is what the parameters take up of its columns, Qᵀ C; `rest` the square of what they leave:
-    information, in errors as stated, where it is `alive`.
+    information, in errors of the fit, where it is `alive`.
     """
 
     single: Single
@@ -166,7 +168,8 @@ class Singles:
 def _without_noise(design: Design, singles: Sequence[Single]) -> tuple[list[Single], list[Single]]:
     """Numbers that may be asked, and those whose column holds the noise of the data itself.
 
-    No number of its own can take up the noise: what leaves residuals that scatter far less than noise was made of them.
+    One number takes up one degree of freedom. If it takes up most of the residuals, and leaves far less than noise, its
+    column was made of the data.
     A level of the sky that was computed from N would explain every residual, and by that every other number as well.
     """
     residual, free = design.projector(design.residual), design.projector.free
@@ -202,9 +205,9 @@ def scored(design: Design, rivals: Sequence[Single]) -> Singles:
 
 
 def stated_conditions(design: Design, singles: Singles | None = None) -> Iterator[str]:
-    """A sentence on the single numbers that the residuals of a fit speak against, the clearest first.
+    """A sentence on the single numbers that the residuals of a fit speak against: fewest amplitudes, then clearest.
 
-    Of a fit that does not explain its data only where one of them alone would.
+    For a fit that does not explain its data there is a sentence only if one of them alone would explain them.
     """
     singles = singles or Singles.of(design)
     clear = singles.clear

@@ -30,9 +30,11 @@ MOST_STEPS = 6  # things that are missing at once; additions of one diagnosis
 MOST_SENTENCES = 2
 MOST_TOGETHER = 4  # numbers of one thing that are tried together: members of a group of descriptions, priors
 MOST_FITTED = 4  # shapes of one effect from which it is fitted; other descriptions that are fitted
-LINEAR_GOOD = 1.0  # evidence by which members of a class that were fitted may differ from their linear steps
-# Relative change of the counts up to which linear steps are right: columns of an earlier model serve again, no
-# reading of the data is asked, and the evidence of a linear step is known to this share of it.
+LINEAR_GOOD = (
+    1.0  # ln B by which the linear step of a candidate reported as indistinguishable may be too small
+)
+# Relative change of the counts up to which linear steps are right: columns of an earlier model serve again, of
+# discrete causes only readings of some exposures are asked, and the evidence of a linear step is known to this share.
 LINEAR = 0.01
 SAME = 0.999  # correlation of two columns from which on they are the same to the data
 POOR_FIT = 1.5  # χ²/dof above which structural effects and other descriptions are tried
@@ -45,14 +47,14 @@ FLOOR = math.sqrt(POOR_FIT)  # σ of residuals behind all candidates above which
 PART = 10.0
 # Difference in evidence below which the better of two is not certain: odds of 19 to 1. More loss in ln p of the
 # exposures of one KIND, as those of others predict them, and in −χ²/2 of that, contradicts an addition.
-EVEN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
+CERTAIN_ODDS = math.log(CERTAIN / (1.0 - CERTAIN))
 # Probability of what is not to be expected: with it noise raises a doubt about how residuals are grouped. Rivals are
 # listed, and members of a class averaged, down to the difference in evidence at which the other one is so probable.
 UNLIKELY = 1e-3
 IMPROBABLE = -math.log(UNLIKELY)
 CHI2_IMPROBABLE = 2.0 * IMPROBABLE  # the same as a difference in χ²
 MOST_WIDTHS = PART  # prior widths by which an amplitude of an optical description, or a prior, may be off
-MOST_PATTERNS = 8  # patterns without a name beside which a candidate is asked
+MOST_PATTERNS = 8  # patterns without a name that describe a remainder
 MOST_CLASSES = 8  # rivals of one name, and names with rivals, that are listed
 
 # Reports

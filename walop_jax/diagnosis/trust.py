@@ -86,15 +86,15 @@ def examined(
 ) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
-    A fit that explains nothing is held against other readings of its data first (`readings`), unless these were
-    tried already (`as_written`), and against stated errors that are too small. `seed` is that of the Monte Carlo p,
-    `candidates` the scores of its residuals in a diagnosis, if there was one.
+    A fit that does not explain its data is held against other readings of them (`discrete`), unless these were tried
+    already (`as_written`), then against `remedies`: larger errors, rows left out, another value of a stated number.
+    `seed` is that of the Monte Carlo p, `candidates` the scores of its residuals in a diagnosis, if there was one.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at; cells of
     whole frames are joined to so many (`joined_cells`), and those spread over the field are asked what differs between
     places.
     A χ² that is a few per cent too large while nothing else is wrong is put down to the stated errors, and the
-    standard errors are made from the residuals. Raises `DataError` with the remedy for data that another reading
-    explains.
+    standard errors are made from the residuals. Raises `DataError` with the remedy for a camera that holds one
+    number everywhere, and for data that another reading explains.
     """
     refuse_dead_cameras(result)
     if not result.converged:

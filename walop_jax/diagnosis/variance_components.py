@@ -15,11 +15,11 @@ that with B = QᵀA and D what the fluxes leave of AᵀA, block by block,
 
     tr G = tr D − tr M,   tr G² = |D|² − 2 tr BDBᵀ + |M|²,   tr G³ = tr D³ − 3 tr BD²Bᵀ + 3 tr BDBᵀM − tr M³,  M = BBᵀ.
 
-Groupings   the gain of each camera, and its response to each Stokes parameter, at each field point (structure finer
-            than any polynomial: flat fields, dust); its gain and gradients over the field in each exposure;
-            its response to each Stokes parameter in each state of the moving elements; its gain and gradients for
-            each night and kind of exposure; its gain and response to each Stokes parameter for each standard. A gain
-            multiplies the counts of an exposure; a response adds light, as a change of an analysis vector does
+Groupings   the gain of each camera, and its response to q and u, at each field point (structure finer than any
+            polynomial: flat fields, dust); its gain and gradients over the field in each exposure; its response to q
+            and u in each state of the moving elements; its gain and gradients for each night and kind of exposure; its
+            gain and response to q and u for each standard. A gain multiplies the counts of an exposure; a response
+            adds light, as a change of an analysis vector does
 Symbols     r whitened residuals; w expected counts / errors of what has a flux in common, of unit length; Q orthonormal
             basis of the derivatives with respect to the free parameters; τ a share of the counts
 Sources     score test of a variance component: Rao 1948; Lin 1997, Biometrika 84, 309. Three moments: Imhof 1961,

@@ -82,9 +82,10 @@ def diagnose(
     `limits.DIAGNOSED_ROWS` (exposure, point) pairs, or whose columns would be more than `limits.DIAGNOSED_NUMBERS`,
     only a sample is used: points spread over the field, or cells of whole frames joined to larger ones. Nothing further
     is tried after `thresholds.MOST_FITS` fits of additions (fewer where the model is far from the data), nor after
-    `minutes`, if given; what is left then has no name, and `Diagnosis.caution` says so. The fits before and after the
-    additions are both examined. With `as_written` no other reading of the data is tried: the caller has done that.
-    Raises what `fit` raises, and `DataError` for data that another reading explains (`readings`).
+    `minutes`, if given; what is left then has no name, and `Diagnosis.caution` says so. The fit after the additions
+    is examined, and the fit before them unless its χ² contradicts it. With `as_written` no other reading of the data is
+    tried: the caller has done that. Raises what `fit` raises, and `DataError` for data that another reading explains
+    (`readings`).
     """
     began = time.perf_counter()
     tell = progress or (lambda text: None)

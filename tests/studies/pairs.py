@@ -1,0 +1,78 @@
+"""Two effects of the catalogue at once: are both named, and could any method with the same prior name them more often?
+
+    PYTHONPATH=tests python tests/studies/pairs.py [--seed 4] [--pairs 60] [--ratio 10]             (five minutes)
+
+The run of the benchmark with that seed (`benchmark/generate.py --new`) is fitted; two effects, each with the
+signal-to-noise ratio by itself and at 5 σ or more from every other name, are added to its residuals with noise, and the
+search names them by linear steps.
+
+The last row is a bound. A posterior says how probable its answer is. Its most probable answer is right as often as it
+says, in the mean, if prior and likelihood are those of the scenes; another method with the same prior is right less
+often. Where the share of right answers agrees with the mean of the probabilities, nothing is left to be won but by
+another prior.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [
+    str(ROOT),
+    *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies", "studies/benchmark")),
+]
+
+from blind import Blind, Cached, Scene  # noqa: E402
+from generate import Layout  # noqa: E402
+from study_options import options_of  # noqa: E402
+
+from walop_jax.diagnosis.search import State, search  # noqa: E402
+from walop_jax.diagnosis.selection import most_probable  # noqa: E402
+
+
+def answered(blind: Blind, scene: Scene) -> tuple[list[str], set[str], float]:
+    """The names that are added, these and those of their classes, and the probability that the posterior gives them."""
+    judge = Cached(blind._spaces, scene.removed)
+    last = search(State(blind.start(scene)), judge).evidence
+    names, held, probability = [], set[str](), most_probable(last).nothing_more
+    for trial, before in judge.adoptions:
+        assert trial.item is not None
+        names.append(trial.name)
+        held |= {trial.name, *trial.rivals, *trial.nameless, *before.close(trial.item)}
+        probability *= trial.probability
+    return names, held, probability
+
+
+def main() -> None:
+    """Print the table."""
+    options = options_of(__doc__, seed=4, pairs=60, ratio=10.0).parse_args()
+    jax.config.update("jax_enable_x64", True)
+    blind = Layout(options.seed).blind
+    blind.rng = np.random.default_rng([options.seed, 99])
+    rows = []
+    for number in range(options.pairs):
+        scene = blind.pair(options.ratio)
+        names, held, probability = answered(blind, scene)
+        truth = set(scene.truth)
+        right, inside = sorted(names) == sorted(truth), truth <= held
+        rows.append((right, inside, len(set(names) - truth), probability))
+        if not right:
+            print(
+                f"{number}: {' and '.join(scene.truth)}: {', '.join(names)} ({probability:.2f})", flush=True
+            )
+    right, inside, false, said = np.mean(rows, axis=0)
+    error = np.std([row[0] - row[3] for row in rows]) / np.sqrt(len(rows))
+    print(f"| both named, nothing else | {100 * right:.0f} % |")
+    print(f"| both named or in a class | {100 * inside:.0f} % |")
+    print(f"| false names a pair | {false:.2f} |")
+    print(
+        f"| probability that the posterior gives its answer, mean | {100 * said:.0f} ± {100 * error:.0f} % |"
+    )
+
+
+if __name__ == "__main__":
+    main()
