@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,10 +60,77 @@ def test_folds_split_every_row_once_and_keep_exposures_and_blocks_whole(design):
 
 @pytest.mark.parametrize("scheme", ["exposures", "field blocks"])
 def test_held_out_residuals_of_a_complete_model_are_noise(design, scheme):
-    """A row of four intensities with its flux eliminated holds three numbers: 3/4 each, a little more unseen."""
+    """A row of four intensities with its flux eliminated holds three numbers: 3/4 each, whatever is open."""
     found = held_out(design, scheme)
-    assert 0.7 < found < 0.95
+    assert found == pytest.approx(0.75, abs=4.0 * np.sqrt(2.0 * 0.75 / design.rows))
     assert found > np.mean(design.residual[: design.rows] ** 2)
+
+
+def laid_out(columns, residual, widths, effects, scale=1.0):
+    """What `held_out` asks of a design of 40 points with 5 rows each; `effects` are columns, of priors `widths`."""
+    side = np.arange(40) % 5, np.arange(40) // 5
+    points = SimpleNamespace(x=side[0] - 2.0, y=side[1] / 2.0)
+    model = SimpleNamespace(
+        effect_names=("one",) if effects else (), positions=lambda name: effects, free=np.arange(len(widths))
+    )
+    fit = SimpleNamespace(calset=SimpleNamespace(points=points), model=model, noise_scale=scale)
+    rows = np.concatenate([columns, np.diag(1.0 / widths)]) / scale
+    residual = np.append(residual, np.zeros(len(widths))) / scale
+    at = np.linalg.lstsq(rows, residual, rcond=None)[0]
+    given = {
+        "fit": fit,
+        "point": np.repeat(np.arange(40), 5),
+        "jacobian": rows,
+        "residual": residual - rows @ at,
+    }
+    design = object.__new__(Design)
+    for name, value in given.items():
+        object.__setattr__(design, name, value)
+    return design
+
+
+def test_held_out_data_count_by_the_covariance_of_their_prediction():
+    """Written out: the data of the other folds alone, their best parameters, and Σ of what they leave open."""
+    rng = np.random.default_rng(5)
+    columns, residual, widths = (
+        rng.standard_normal((200, 4)),
+        rng.standard_normal(200),
+        np.array([3.0, 9.0, 1e3, 0.4]),
+    )
+    design, total = laid_out(columns, residual, widths, [2, 3], 2.0), 0.0
+    for k in range(5):
+        out = field_folds(design) == k
+        normal = columns[~out].T @ columns[~out] / 4.0 + np.diag(widths**-2.0) / 4.0
+        best = np.linalg.solve(normal, columns[~out].T @ residual[~out] / 4.0)
+        error, a = (residual[out] - columns[out] @ best) / 2.0, columns[out][:, :2] / 2.0
+        spread = np.eye(out.sum()) + a @ np.linalg.solve(normal[:2, :2], a.T)
+        total += 4.0 * error @ np.linalg.solve(spread, error)
+    assert held_out(design, "field blocks") == pytest.approx(total / 200, rel=1e-9)
+
+
+def test_what_other_data_do_not_determine_speaks_against_no_effect():
+    """A throughput that one part of the field alone shows: its prediction is worth nothing, with the effect or without.
+
+    The column of the effect is partly that throughput, so that the effect changes how wrong the prediction is. An
+    effect that is there is confirmed, one that is not is worse.
+    """
+    rng = np.random.default_rng(1)
+    here = field_folds(laid_out(np.zeros((200, 1)), np.zeros(200), np.ones(1), [])) == 0
+    throughput = np.where(here, 30.0, 1e-3)[:, None] * rng.standard_normal((200, 1))
+    right, wrong = rng.standard_normal((2, 200, 1))
+    right = right + 0.5 * throughput
+    confirmed = []
+    for _ in range(40):
+        data = rng.standard_normal(200) + 0.5 * right[:, 0] + 5.0 * throughput[:, 0]
+        before = held_out(laid_out(throughput, data, np.array([1e3]), []), "field blocks")
+        of_effects = [
+            held_out(laid_out(np.hstack([throughput, c]), data, np.array([1e3, 1.0]), [1]), "field blocks")
+            for c in (right, wrong)
+        ]
+        confirmed.append([after < before for after in of_effects])
+    there, absent = np.mean(confirmed, axis=0)
+    assert there > 0.9
+    assert absent < 0.5
 
 
 @pytest.mark.long

@@ -448,19 +448,33 @@ def field_folds(design: Design) -> Int[np.ndarray, " d"]:
 def held_out(design: Design, scheme: str) -> float:
     """Mean squared normalised residual on data that took no part in a fit: each fold is predicted by the others.
 
-    These, and the priors, move the free parameters by one Gauss–Newton step from the joint minimum: a fraction of the
-    standard errors, where the model is linear to better than that fraction squared. Noise alone gives 1 − 1/K with K
-    cameras when the flux is free.
+    The other folds, and the priors, move the free parameters by one Gauss–Newton step from the joint minimum: a
+    fraction of the standard errors, where the model is linear to better than that fraction squared. What they do not
+    determine, such as throughputs beyond their last field point, they cannot predict with any model; prediction errors
+    d of a fold are therefore in units of what the parameters besides those of effects leave open,
+
+        dᵀ Σ⁻¹ d,   Σ = 1 + A H⁻¹ Aᵀ,   Σ⁻¹ = 1 − A (H + AᵀA)⁻¹ Aᵀ
+
+    Effects gain nothing by being vague: their columns are not in A. Noise alone gives 1 − 1/K with K cameras when the
+    flux is free.
+
+    Symbols     A rows of the Jacobian of the fold, H normal matrix of all other rows, both of the parameters besides
+                those of effects
     """
     fold = {"exposures": exposure_folds, "field blocks": field_folds}[scheme](design)
-    squares, (unit, norm) = np.zeros(HOLDOUT_FOLDS), unit_columns(design.jacobian)
+    squares, (unit, _) = np.zeros(HOLDOUT_FOLDS), unit_columns(design.jacobian)
+    ridge, model = 1e-12 * np.eye(unit.shape[1]), design.fit.model
+    of_effects = [design.columns_of(model.positions(name)) for name in model.effect_names]
+    bare = np.delete(unit, np.concatenate(of_effects), axis=1) if of_effects else unit
+    whole = bare.T @ bare + ridge[: bare.shape[1], : bare.shape[1]]
     for k in np.unique(fold):
         rows = np.flatnonzero(fold == k)
-        scaled, r = np.delete(unit, rows, axis=0), np.delete(design.residual, rows)
-        step = -np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(norm)), scaled.T @ r) / norm
-        predicted = design.residual[rows] + design.jacobian[rows] @ step
-        squares[k] = predicted @ predicted * design.fit.noise_scale**2
-    return float(squares.sum() / len(fold))
+        others, r = np.delete(unit, rows, axis=0), np.delete(design.residual, rows)
+        step = -np.linalg.solve(others.T @ others + ridge, others.T @ r)
+        error = design.residual[rows] + unit[rows] @ step
+        open_to_it = bare[rows].T @ error
+        squares[k] = error @ error - open_to_it @ np.linalg.solve(whole, open_to_it)
+    return float(squares.sum() / len(fold)) * design.fit.noise_scale**2
 
 
 # ----------------------------------------------------------------------------------------------- the scores of patterns
