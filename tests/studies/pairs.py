@@ -1,15 +1,12 @@
-"""Two effects of the catalogue at once: are both named, and could any method with the same prior name them more often?
+"""Two effects of the catalogue at once: are both named, in runs that the search has never seen?
 
-    PYTHONPATH=tests python tests/studies/pairs.py [--seed 4] [--pairs 60] [--ratio 10]             (five minutes)
+    PYTHONPATH=tests python tests/studies/pairs.py [--seed 4] [--pairs 60] [--ratio 10]              (two minutes)
 
 The run of the benchmark with that seed (`benchmark/generate.py --new`) is fitted; two effects, each with the
-signal-to-noise ratio by itself and at 5 σ or more from every other name, are added to its residuals with noise, and the
-search names them by linear steps.
+signal-to-noise ratio by itself, are added to its residuals with noise, and the search names them by linear steps.
 
-The last row is a bound. A posterior says how probable its answer is. Its most probable answer is right as often as it
-says, in the mean, if prior and likelihood are those of the scenes; another method with the same prior is right less
-often. Where the share of right answers agrees with the mean of the probabilities, nothing is left to be won but by
-another prior.
+The last row is the mean of the probabilities that the posterior gives its answers. It may be lower than the share of
+right ones: every scene holds effects of the catalogue, which the posterior does not know.
 """
 
 from __future__ import annotations
