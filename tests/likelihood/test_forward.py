@@ -20,7 +20,7 @@ from walop_jax.fit.forward import forward
 from walop_jax.likelihood import optics
 from walop_jax.likelihood.forward import Forward
 from walop_jax.model import light, materials
-from walop_jax.model.effects import effect_by_name
+from walop_jax.model.effects import Described, effect_by_name
 from walop_jax.model.effects.in_models import effect_context, with_effects
 from walop_jax.model.instrument import Instrument, nominal_instrument
 from walop_jax.model.parameters import values_of, with_values
@@ -285,6 +285,45 @@ def test_directions_are_fewer_than_parameters(plan: Plan):
         instrument, Settings.default(1, "band"), {"band": builders.monochromatic(0.62)}
     )
     assert optics.directions(instrument, without).count == 5  # no calibration plate in the beam
+
+
+SMOOTH = [
+    f"retardance {axis} behind half1.plate * field {i} {j}"
+    for axis in "qu"
+    for i in range(3)
+    for j in range(2)
+]
+
+
+@pytest.mark.parametrize(
+    ("texts", "further"),
+    [
+        (SMOOTH, 2),
+        ([*SMOOTH, "gain of O1 * field 1 2", "diattenuation q behind collimator * x"], 3),
+        (["thickness of half2.plate.quartz", "thickness of half2.plate.quartz * r2", *SMOOTH[:2]], 1),
+        (["displacement x ahead of pupil", *SMOOTH], 1 + len(SMOOTH)),
+    ],
+)
+def test_terms_of_one_change_over_the_field_share_a_direction(plan: Plan, texts: list[str], further: int):
+    """The derivatives are those of JAX, also where patterns vanish; a displaced field has other patterns behind it."""
+    bare = nominal_instrument()
+    device = dataclasses.replace(
+        bare, effects=(Described.saying(texts, np.linspace(1e-3, 3e-3, len(texts))),)
+    )
+    along = optics.directions(device, plan)
+    assert along.count <= optics.directions(bare, plan).count + further
+    values = values_of(device)
+    for x, y in ((0.2, -0.1), (0.0, 0.0), (0.0, 0.25)):
+        at = jnp.asarray(x), jnp.asarray(y)
+        expected = jax.jit(jax.jacfwd(lambda v, at=at: light.band_rows(with_values(device)(v), plan, *at)))(
+            values
+        )
+        result = jax.jit(jax.jacfwd(lambda v, at=at: optics.band_rows(v, device, plan, *at)))(values)
+        _, slopes = jax.jit(lambda at=at: optics.rows_and_slopes(device, plan, *at))()
+        np.testing.assert_allclose(result, expected, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            np.moveaxis(slopes, 0, -1), expected[..., along.index], atol=1e-11 * np.abs(expected).max()
+        )
 
 
 # ---------------------------------------------------------------------------------------- parts of the instrument

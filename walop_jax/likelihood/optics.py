@@ -10,6 +10,10 @@ Parameters that change no row in common are differentiated together: a plate in 
 the other half as they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Inst. Maths Applics 13,
 117). Which parameter reaches which rows is found by following it through the operations, not declared.
 
+The terms of one change that grow with different patterns p_k of the field, such as the 28 of a smooth field, enter at a
+point by their sum Σ a_k p_k(X, Y) alone: one direction, along p_k / Σ p_k², gives the slope s in that sum, and
+∂R/∂a_k = p_k s.
+
 Units       parameters in their units; field coordinates deg.
 Limits      all but parameters (field position, wavelengths, other arrays of the instrument) is differentiated
             by JAX, without a rule.
@@ -18,6 +22,8 @@ Limits      all but parameters (field position, wavelengths, other arrays of the
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,9 +35,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from walop_jax.model import light
 from walop_jax.model.compiled import derivatives
+from walop_jax.model.conventions import Units
 from walop_jax.model.dependence import optical_reach
+from walop_jax.model.effects import Change, Described
+from walop_jax.model.effects.change import AtPoint, product
+from walop_jax.model.effects.optics import Displaced
 from walop_jax.model.instrument import Instrument
-from walop_jax.model.parameters import ParameterVector, Scalar, values_of, with_values
+from walop_jax.model.parameters import ParameterVector, Scalar, leaves, values_of, with_values
 from walop_jax.model.plan import Plan
 from walop_jax.model.specification import series_indices
 
@@ -41,42 +51,84 @@ class Directions:
     """Directions in parameter space along which the rows are differentiated.
 
     Parameter `index[o]` belongs to direction `colour[o]`, together with other parameters that change none of its rows;
-    `reached[o]` is True for the rows that it changes.
+    `reached[o]` is True for the rows that it changes. Parameters of one `family[o]` are the terms of one change, which
+    differ in their `patterns[o]`, texts of factors over the field in `units`; a parameter alone has none.
     """
 
     index: Int[np.ndarray, " o"]
     colour: Int[np.ndarray, " o"]
     reached: Bool[np.ndarray, "o r"]
+    family: Int[np.ndarray, " o"]
+    patterns: tuple[tuple[str, ...], ...]
+    units: Units
 
     @property
     def count(self) -> int:
         """Number of directions."""
         return int(self.colour.max(initial=-1)) + 1
 
-    def seeds(self, parameters: int) -> Float[np.ndarray, "c n"]:
-        """The directions (c, n) as changes of all parameters, ones and zeros."""
-        seeds = np.zeros((self.count, parameters))
-        seeds[self.colour, self.index] = 1.0
-        return seeds
+    def sizes(self, x: Scalar, y: Scalar) -> Float[Any, " o"]:
+        """The pattern of every parameter at a field position (deg); 1 for a parameter alone."""
+        if not any(self.patterns):
+            return np.ones(len(self.index))
+        value = functools.cache(lambda text: product((text,), AtPoint(x, y), self.units))
+        return jnp.stack(
+            [jnp.asarray(math.prod(map(value, texts)), float) + 0.0 * x for texts in self.patterns]
+        )
+
+    def seeds(self, parameters: int, x: Scalar, y: Scalar) -> Float[Any, "c n"]:
+        """The directions (c, n) at a field position (deg) as changes of all parameters: p_k / Σ p_k², else 1 and 0."""
+        sizes = self.sizes(x, y)
+        squares = jnp.zeros(len(sizes)).at[self.family].add(sizes**2)[self.family]
+        along = jnp.where(squares > 0.0, sizes / jnp.where(squares > 0.0, squares, 1.0), 0.0)
+        return jnp.zeros((self.count, parameters)).at[self.colour, self.index].set(along)
 
 
 def directions(instrument: Instrument, plan: Plan) -> Directions:
-    """The directions for an instrument and a plan, as few as a greedy choice gives; parameters of one direction change
-    no row in common.
+    """The directions for an instrument and a plan, as few as a greedy choice gives.
+
+    Parameters of one direction change no row in common, or are terms of one change over the field.
     """
     reach = optical_reach(instrument, plan)
     rows = np.repeat(reach, [arm.analyser.rows for arm in instrument.arms], axis=0).T
     if light.is_dispersed(instrument):
         rows = np.tile(rows, 2)
+    changes = _described(instrument)
+    of_cameras = [i for i, change in changes.items() if change.of_camera]
+    rows[of_cameras] = False  # they share an array with changes of the optics, and change no row
     index = np.flatnonzero(rows.any(axis=1))
-    colour, used = [], []
-    for reached in rows[index]:
+    families = dict[Any, list[int]]()
+    for o, i in enumerate(index.tolist()):
+        key = dataclasses.replace(changes[i], factors=changes[i].beside_field) if i in changes else i
+        families.setdefault(key, []).append(o)
+    family, colour, used = np.zeros(len(index), int), np.zeros(len(index), int), []
+    patterns = [()] * len(index)
+    for number, members in enumerate(families.values()):
+        reached = rows[index[members]].any(axis=0)
         k = next((k for k, rows_used in enumerate(used) if not (rows_used & reached).any()), len(used))
         if k == len(used):
             used.append(np.zeros(rows.shape[1], bool))
         used[k] = used[k] | reached
-        colour.append(k)
-    return Directions(index, np.array(colour, int), rows[index])
+        colour[members], family[members] = k, number
+        if len(members) > 1:
+            for o in members:
+                patterns[o] = changes[int(index[o])].over_field
+    return Directions(index, colour, rows[index], family, tuple(patterns), instrument.units)
+
+
+def _described(instrument: Instrument) -> dict[int, Change]:
+    """The changes of a description by the positions of their amplitudes among the parameters.
+
+    None where the field itself is displaced: the patterns of what comes behind are then those of another point.
+    """
+    texts = [
+        text for effect in instrument.effects if isinstance(effect, Described) for text in effect.sentences
+    ]
+    changes = {f"{Described.name}.{change.label}": change for change in map(Change.parsed, texts)}
+    if not changes or any(isinstance(element, Displaced) for element in instrument.patched().train()):
+        return {}
+    names = enumerate(parameter.name for parameter in leaves(instrument))
+    return {i: changes[name] for i, name in names if name in changes}
 
 
 def _slopes(
@@ -88,7 +140,7 @@ def _slopes(
     def rows(values: ParameterVector) -> light.Rows:
         return light.band_rows(with_values(instrument)(values), plan, x, y)
 
-    return along, *derivatives(rows, (values,), (jnp.asarray(along.seeds(values.size)),))
+    return along, *derivatives(rows, (values,), (along.seeds(values.size, x, y),))
 
 
 @jax.custom_jvp
@@ -106,7 +158,8 @@ def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, A
     if not isinstance(tangents[0], SymbolicZero):
         # The part of every direction in the change of every row.
         part = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
-        part = part.at[along.colour].add(tangents[0][along.index][:, None] * along.reached)
+        change_of_sums = tangents[0][along.index] * along.sizes(*inputs[2:])
+        part = part.at[along.colour].add(change_of_sums[:, None] * along.reached)
         change = jnp.einsum("cr,cbrs->brs", part, slopes)
     if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
         steps = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
@@ -129,7 +182,8 @@ def rows_and_slopes(
 ) -> tuple[light.Rows, Float[Array, "o b r 4"]]:
     """Band rows at a field position (deg) and their exact derivatives in the parameters of `directions`."""
     along, rows, slopes = _slopes(values_of(instrument), instrument, plan, x, y)
-    return rows, slopes[along.colour] * along.reached[:, None, :, None]
+    sizes = along.sizes(x, y)[:, None] * along.reached
+    return rows, slopes[along.colour] * sizes[:, None, :, None]
 
 
 @jax.custom_jvp
