@@ -76,9 +76,8 @@ class Directions:
             [jnp.asarray(math.prod(map(value, texts)), float) + 0.0 * x for texts in self.patterns]
         )
 
-    def seeds(self, parameters: int, x: Scalar, y: Scalar) -> Float[Any, "c n"]:
-        """The directions (c, n) at a field position (deg) as changes of all parameters: p_k / Σ p_k², else 1 and 0."""
-        sizes = self.sizes(x, y)
+    def seeds(self, parameters: int, sizes: Float[Any, " o"]) -> Float[Any, "c n"]:
+        """The directions (c, n) as changes of all parameters: p_k / Σ p_k² where patterns have `sizes` p, else 1."""
         squares = jnp.zeros(len(sizes)).at[self.family].add(sizes**2)[self.family]
         along = jnp.where(squares > 0.0, sizes / jnp.where(squares > 0.0, squares, 1.0), 0.0)
         return jnp.zeros((self.count, parameters)).at[self.colour, self.index].set(along)
@@ -102,7 +101,7 @@ def directions(instrument: Instrument, plan: Plan) -> Directions:
         key = dataclasses.replace(changes[i], factors=changes[i].beside_field) if i in changes else i
         families.setdefault(key, []).append(o)
     family, colour, used = np.zeros(len(index), int), np.zeros(len(index), int), []
-    patterns = [()] * len(index)
+    patterns: list[tuple[str, ...]] = [()] * len(index)
     for number, members in enumerate(families.values()):
         reached = rows[index[members]].any(axis=0)
         k = next((k for k, rows_used in enumerate(used) if not (rows_used & reached).any()), len(used))
@@ -133,14 +132,16 @@ def _described(instrument: Instrument) -> dict[int, Change]:
 
 def _slopes(
     values: ParameterVector, instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
-) -> tuple[Directions, light.Rows, Float[Array, "c b r 4"]]:
-    """Band rows and their derivatives along `directions`."""
+) -> tuple[Directions, Float[Any, "o r"], light.Rows, Float[Array, "c b r 4"]]:
+    """Band rows and their derivatives along `directions`, of which every parameter has a share in every row."""
     along = directions(instrument, plan)
+    sizes = along.sizes(x, y)
 
     def rows(values: ParameterVector) -> light.Rows:
         return light.band_rows(with_values(instrument)(values), plan, x, y)
 
-    return along, *derivatives(rows, (values,), (along.seeds(values.size, x, y),))
+    shares = sizes[:, None] * along.reached
+    return along, shares, *derivatives(rows, (values,), (along.seeds(values.size, sizes),))
 
 
 @jax.custom_jvp
@@ -153,13 +154,12 @@ def band_rows(
 
 def _rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     values, *inputs = primals
-    along, rows, slopes = _slopes(values, *inputs)
+    along, shares, rows, slopes = _slopes(values, *inputs)
     change = jnp.zeros_like(rows)
     if not isinstance(tangents[0], SymbolicZero):
         # The part of every direction in the change of every row.
         part = jnp.zeros(slopes.shape[:1] + rows.shape[1:2])
-        change_of_sums = tangents[0][along.index] * along.sizes(*inputs[2:])
-        part = part.at[along.colour].add(change_of_sums[:, None] * along.reached)
+        part = part.at[along.colour].add(tangents[0][along.index][:, None] * shares)
         change = jnp.einsum("cr,cbrs->brs", part, slopes)
     if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangents[1:])):
         steps = jax.tree.map(_instantiated, tangents[1:], is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
@@ -181,9 +181,8 @@ def rows_and_slopes(
     instrument: Instrument, plan: Plan, x: Scalar, y: Scalar
 ) -> tuple[light.Rows, Float[Array, "o b r 4"]]:
     """Band rows at a field position (deg) and their exact derivatives in the parameters of `directions`."""
-    along, rows, slopes = _slopes(values_of(instrument), instrument, plan, x, y)
-    sizes = along.sizes(x, y)[:, None] * along.reached
-    return rows, slopes[along.colour] * sizes[:, None, :, None]
+    along, shares, rows, slopes = _slopes(values_of(instrument), instrument, plan, x, y)
+    return rows, slopes[along.colour] * shares[:, None, :, None]
 
 
 @jax.custom_jvp

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from walop_jax.model.conventions import FIELD_SCALE
 
@@ -30,9 +30,13 @@ def _one_dimension(t: Float[Any, ...], degree: int) -> list[Float[Any, ...]]:
     return values
 
 
-def polynomial(degree: int, t: Float[Array, ...]) -> Float[Array, ...]:
-    """The polynomial of one degree."""
-    return _one_dimension(t, degree)[degree]
+def polynomial(degree: int, t: Float[Any, ...]) -> Float[Any, ...]:
+    """The polynomial of one degree by Horner's rule in t², which takes fewer operations than the recursion."""
+    *lower, highest = np.polynomial.legendre.leg2poly(np.eye(degree + 1)[degree])[degree % 2 :: 2]
+    value = t * 0.0 + highest
+    for coefficient in reversed(lower):
+        value = value * t**2 + coefficient
+    return value * t if degree % 2 else value
 
 
 def basis(

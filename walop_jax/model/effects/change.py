@@ -261,7 +261,7 @@ class Change:
 
     def in_train(self, ray: Ray, angle: Any) -> Any:
         """Product of its factors for a ray, in an element at `angle` (deg)."""
-        return self.factor(_InTrain(ray, angle))
+        return self.factor(InTrain(ray, angle))
 
     def check_factors(self, instrument: Instrument) -> None:
         """Raise ValueError for a factor beyond those of the kind."""
@@ -347,6 +347,17 @@ def product(factors: Iterable[FactorLike], at: Any, units: Units) -> Any:
     return functools.reduce(operator.mul, values, 1.0)
 
 
+def with_factors(terms: Iterable[Term], at: Any) -> list[tuple[Change, Any]]:
+    """The changes with amplitude × factors at `at`; a factor that several changes have is computed once."""
+    value = functools.cache(lambda text, units: factor(text).value(at, units))
+
+    def size_of(change: Change, amplitude: Scalar) -> Any:
+        values = (value(f, change.units) if isinstance(f, str) else f(at) for f in change.factors)
+        return amplitude * functools.reduce(operator.mul, values, 1.0)
+
+    return [(change, size_of(change, amplitude)) for change, amplitude in terms]
+
+
 def add(size: Scalar) -> Any:
     """Function that adds an amplitude to a number, or to an absent one."""
     return lambda value: size if value is None else value + size
@@ -356,7 +367,7 @@ def add(size: Scalar) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class _InTrain:
+class InTrain:
     """Quantities of a ray; `axis` (deg) is the angle of the moving element."""
 
     ray: Ray

@@ -30,12 +30,14 @@ from walop_jax.model.effects.change import (
     ChangeKind,
     Combinations,
     Grows,
+    InTrain,
     Scalar,
     SlotTerm,
     Term,
     in_exposures,
     itself,
     product,
+    with_factors,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, SHAPE, WAVELENGTH
 from walop_jax.model.elements.base import Element, Mueller
@@ -143,8 +145,7 @@ class Terms(Element):
     def mueller(self, ray: Ray) -> Mueller:
         """Mueller matrices of all the changes together at the wavelengths of a ray."""
         terms = zip(self.changes, self.amplitudes, strict=True)
-        sizes = [(change, size * change.in_train(ray, self.axis)) for change, size in terms]
-        return matrix_of(sizes, ray.x, ray.y)
+        return matrix_of(with_factors(terms, InTrain(ray, self.axis)), ray.x, ray.y)
 
 
 class Film(Component):
