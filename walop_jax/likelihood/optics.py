@@ -22,7 +22,6 @@ Limits      all but parameters (field position, wavelengths, other arrays of the
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +37,8 @@ from walop_jax.model.compiled import derivatives
 from walop_jax.model.conventions import Units
 from walop_jax.model.dependence import optical_reach
 from walop_jax.model.effects import Change, Described
-from walop_jax.model.effects.change import AtPoint, product
+from walop_jax.model.effects.change import AtPoint
+from walop_jax.model.effects.factors import values_at
 from walop_jax.model.effects.optics import Displaced
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import ParameterVector, Scalar, leaves, values_of, with_values
@@ -71,10 +71,9 @@ class Directions:
         """The pattern of every parameter at a field position (deg); 1 for a parameter alone."""
         if not any(self.patterns):
             return np.ones(len(self.index))
-        value = functools.cache(lambda text: product((text,), AtPoint(x, y), self.units))
-        return jnp.stack(
-            [jnp.asarray(math.prod(map(value, texts)), float) + 0.0 * x for texts in self.patterns]
-        )
+        value = values_at(AtPoint(x, y))
+        sizes = (math.prod(value(text, self.units) for text in texts) for texts in self.patterns)
+        return jnp.stack([jnp.asarray(size, float) + 0.0 * x for size in sizes])
 
     def seeds(self, parameters: int, sizes: Float[Any, " o"]) -> Float[Any, "c n"]:
         """The directions (c, n) as changes of all parameters: p_k / Σ p_k² where patterns have `sizes` p, else 1."""

@@ -23,7 +23,8 @@ def terms(degree: int) -> tuple[tuple[int, int], ...]:
     return tuple((n - j, j) for n in range(degree + 1) for j in range(n + 1))
 
 
-def _one_dimension(t: Float[Any, ...], degree: int) -> list[Float[Any, ...]]:
+def polynomials(t: Float[Any, ...], degree: int) -> list[Float[Any, ...]]:
+    """The polynomials of all degrees up to one."""
     values = [t * 0.0 + 1.0, t]
     for k in range(1, degree):
         values.append(((2 * k + 1) * t * values[k] - k * values[k - 1]) / (k + 1))
@@ -44,6 +45,6 @@ def basis(
 ) -> Float[Any, "... t"]:
     """Values of all terms at field positions in degrees; arrays of numpy stay so."""
     xp = jnp if isinstance(x, jax.Array) else np
-    px, py = (xp.stack(_one_dimension(t / scale, degree)[: degree + 1], axis=-1) for t in (x, y))
+    px, py = (xp.stack(polynomials(t / scale, degree)[: degree + 1], axis=-1) for t in (x, y))
     i, j = np.array(terms(degree)).T
     return px[..., i] * py[..., j]

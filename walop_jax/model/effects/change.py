@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from walop_jax.data.kinds import POLARISER
 from walop_jax.model.conventions import OF_WALOP, Units
-from walop_jax.model.effects.factors import FIELD, Factor, factor, smooth_deviations
+from walop_jax.model.effects.factors import FIELD, Factor, factor, smooth_deviations, values_at
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import check_names
@@ -349,7 +349,7 @@ def product(factors: Iterable[FactorLike], at: Any, units: Units) -> Any:
 
 def with_factors(terms: Iterable[Term], at: Any) -> list[tuple[Change, Any]]:
     """The changes with amplitude × factors at `at`; a factor that several changes have is computed once."""
-    value = functools.cache(lambda text, units: factor(text).value(at, units))
+    value = values_at(at)
 
     def size_of(change: Change, amplitude: Scalar) -> Any:
         values = (value(f, change.units) if isinstance(f, str) else f(at) for f in change.factors)

@@ -109,10 +109,9 @@ class Described(Effect):
 
     def terms(self) -> Iterator[tuple[Change, Scalar]]:
         """Every change with its amplitude."""
-        count = dict.fromkeys(AMPLITUDES, 0)
+        amplitudes = {name: iter(getattr(self, name)) for name in AMPLITUDES}
         for change in map(Change.parsed, self.sentences):
-            yield change, getattr(self, change.parameter)[count[change.parameter]]
-            count[change.parameter] += 1
+            yield change, next(amplitudes[change.parameter])
 
     def first_order(self, instrument: Instrument) -> tuple[tuple[tuple[float, Change], ...], ...]:
         """For each amplitude its one change, with the coefficient 1."""

@@ -69,7 +69,11 @@ def _ring(at: Any, units: Units, degree: str) -> Any:
 def _smooth(at: Any, units: Units, i: str, j: str) -> Any:
     """The term P_i(X/h) P_j(Y/h) of a smooth field, times its standard deviation beforehand (`smooth_deviations`)."""
     of_x, of_y = (legendre.polynomial(int(degree), t / units.field) for degree, t in ((i, at.x), (j, at.y)))
-    return smooth_deviations()[int(i)] * smooth_deviations()[int(j)] * of_x * of_y
+    return _deviation(i, j) * of_x * of_y
+
+
+def _deviation(i: str, j: str) -> float:
+    return smooth_deviations()[int(i)] * smooth_deviations()[int(j)]
 
 
 def _wave(at: Any, _: Units, wave: str, order: str, prefix: str) -> Any:
@@ -254,3 +258,22 @@ def factor(text: str) -> Factor:
             of_given = functools.partial(lambda value, given, *at: value(*at, *given), value, given)
             return Factor(text, depends_on, words, test, of_given, text.split()[0], given)
     raise unknown_name("factor", text, (*PLAIN, *FORMS))
+
+
+def values_at(at: Any) -> Callable[[str, Units], Any]:
+    """The values of factors at `at` by text, each computed once; terms of a smooth field share their polynomials."""
+
+    @functools.cache
+    def polynomials(units: Units) -> list[list[Any]]:
+        return [legendre.polynomials(t / units.field, SMOOTH_DEGREE) for t in (at.x, at.y)]
+
+    @functools.cache
+    def value(text: str, units: Units) -> Any:
+        item = factor(text)
+        if item.form != "field":
+            return item.value(at, units)
+        of_x, of_y = polynomials(units)
+        i, j = item.given
+        return _deviation(i, j) * of_x[int(i)] * of_y[int(j)]
+
+    return value
