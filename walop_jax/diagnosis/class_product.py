@@ -51,12 +51,13 @@ def changes_in(sums: Sequence[WeightedChanges]) -> list[Change]:
 
 
 class Answer(NamedTuple):
-    """One answer to a question: its words, ln B against the model without what was added, its amplitudes in changes.
+    """One answer to a question: its `name` in words, its `evidence` (ln B; 0 without the addition), its amplitudes.
 
-    `values` is the change of the free parameters of the fit, where those of what was added become 0, `slopes` is that
-    by its amplitudes, which have a `covariance`: empty for the addition itself, which the fit has. `change` is that of
-    the elements of the matrix at the field points. `acting` are the positions of the amplitudes that act on starlight
-    and are in the model of the product (None: all); the others only shift the parameters.
+    Every amplitude is a sum of weighted changes (`sums`). `values` (n) is the change of the free parameters of the fit,
+    by which amplitudes of the addition become 0; `slopes` (n, a) are its derivatives by the `amplitudes` (a), whose
+    covariance is `covariance` (a, a). All four are empty for the addition itself, which is in the fit. `change` (p, m)
+    is that of the elements of the matrix at the field points. `acting` are the positions of the amplitudes that act on
+    starlight and are in the model of the product (None: all); the others only shift the parameters.
     """
 
     name: str

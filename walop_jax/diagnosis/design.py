@@ -11,14 +11,16 @@ light           N_k → N_k + a · F · L_k · pattern: light is added, whatever
 
 vector          light, in proportion to q or u: one element of the analysis vector of one camera × field polynomials up
                 to degree 4: anything linear in the light (a Mueller effect) that is smooth in the field
-harmonic        gain and light: 1θ, 3θ, 4θ, 5θ, 6θ of the polariser angle in one camera × field polynomials up to
-                degree 1: what no Mueller matrix behind the polariser can make
+harmonic        gain and light: 1θ, 3θ, 4θ, 5θ, 6θ of the angle of the polariser, or of a moving element other than the
+                calibration plate, in one camera × field polynomials up to degree 1. Of the polariser these are what no
+                Mueller matrix behind it can make
 fine structure  gain and light × field polynomials of degree 5 to 8
 rings           gain and light × polynomials of the squared field radius, of degree 3 to 8 in it
 time, flux, temperature   gain and light of all cameras, linear in that quantity
 kind, filter, plate       the response to I, q and u (light), and the gain, of all cameras, between kinds of exposure,
                 filters, plate settings; for kinds also gradients over the field, of gain and of light
-single exposures          gain, and light, of each camera in each exposure, where it is seen at several field points
+single exposures          gain, and light, in each exposure, of the cameras `Measured.gained` (all but one of those with
+                a flux in common), where exposures have `MANY_POINTS` field points on average
 states          gain of each camera in each state, the same in all filters, where there are several: a state is all
                 exposures that differ in nothing but the filter
 
@@ -28,8 +30,8 @@ exposures of the field point, for light of unit flux (light).
 Scores of all patterns against a fit (`pattern_scores`) come from one number for each exposure at a point instead of
 each intensity.
 
-Equation    A pattern of camera k changes the counts of that camera alone: its column is v (e_k − m m_k) in every row,
-                C_aᵀC_b = Σ v_a v_b (δ_kl − m_k m_l),   QᵀC_a = Σ v_a (Q_k − m_k (m·Q))
+Equation    A pattern of camera k changes the counts of that camera alone: its column is −v (e_k − m m_k) in every row,
+                C_aᵀC_b = Σ v_a v_b (δ_kl − m_k m_l),   QᵀC_a = −Σ v_a (Q_k − m_k (m·Q))
             and behind the base G = CᵀC − (QᵀC)ᵀ(QᵀC).
 Symbols     a, b patterns of the cameras k, l; v = change of the counts / error, for a gain expected counts × pattern /
             error, for light F L_k × pattern / error; m = expected counts / errors of all with a flux in common, of

@@ -4,7 +4,8 @@ A *group* of descriptions is one candidate of the score test: a linear retarder 
 sine, a gradient two directions.
 
     kinds         those of `model.effects`, in the groups of `optics.GROUPS`
-    places        ahead of and behind every element that acts on polarisation, in the common train and in the arms; of
+    places        ahead of the polariser (without one: of the first element) and of each arm, behind the polariser and
+                  every later element that acts on polarisation, in the common train and in the arms; of
                   the polariser, another moving element, a wave plate, a camera, an arm, a source
     dependence    those that `ChangeKind.grows` names of a kind at a place: patterns over the field, each with every
                   dependence on wavelength, time, temperature, hour angle, angles, exposures and counts

@@ -1,12 +1,13 @@
 """Detection limits of an observing plan: those of the sets that it will give, by instruments as they may be built.
 
 What a set shows depends on its instrument, and that is not the one that was designed: light that passes from camera to
-camera, for one, hides where all cameras are alike. It depends on the weather as well: a pedestal is light in proportion
-to the flux, like any other, while the flux never changes. A forecast from the design in steady weather is therefore
+camera, for one, hides where all cameras are alike. It depends on the weather as well: while the flux never changes, a
+pedestal cannot be told from light in proportion to the flux. A forecast from the design in steady weather is therefore
 wrong. Here sets are simulated as `simulate` would draw them, without noise, and asked in turn.
 
 Forecast    Of the amplitudes that are detected the smallest and the largest of all instruments and shapes; of all else
             the worst of the instruments: what is named, errors that could hide, effects that are taken for each other.
+            Untestable is what none of the instruments shows.
 """
 
 from __future__ import annotations

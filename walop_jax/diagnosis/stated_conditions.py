@@ -12,9 +12,11 @@ field only its own place, so that scale and angle are sums of X and Y, row by ro
 
 The coordinates and times of sky exposures, the site and ROTATOR are asked in the same way, and the share of the sky
 (SKY) that is left in the counts. A number of the instrument that is thought to be known, and is not, looks much like
-these: the prior of each parameter, and those of each element together, are rivals with the column (mean −
-value)/width. So are terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal, scattered
-light (the median counts of an exposure), light of another camera. What cannot be separated is reported together.
+these: the prior of each parameter, and those of an element with up to four numbers together, are rivals: their
+columns are the derivatives of (mean − value)/width with respect to the mean, in widths. So are effects of the catalogue
+(`_asked_effects`), and terms of one camera with one amplitude: a non-linearity (its counts squared), a pedestal,
+scattered light (the median counts of an exposure), light of another camera. What cannot be separated is reported
+together.
 
 Limits      Mistakes that free parameters absorb whole show in no residual: with a single filter its displacement, the
             thicknesses of the plates look the same. One number at a time, by a linear step: the size is a hint.

@@ -64,11 +64,11 @@ class _Mistake(NamedTuple):
 
 
 def undetected_errors(design: Design, singles: Singles) -> Hidden:
-    """Single mistakes at the size detected with 99 % probability, and their consequences.
+    """Single mistakes at the largest size that hides (h above), and their consequences.
 
-    Kept are those that move the parameters by more than their standard errors, and effects that act on starlight; first
-    those that make q and u of stars most wrong, in the median over the field. Of those that the data measure,
-    `MOST_HIDDEN` stay.
+    Kept are those that move the parameters by more than their standard errors, effects that act on starlight, and
+    effects of elements out of the beam in the usual setting on which the data hold no information; first those that
+    make q and u of stars most wrong, in the median over the field. Of those that the data measure, `MOST_HIDDEN` stay.
     """
     fit = design.fit
     places = np.unique(np.linspace(0, len(fit.calset.points) - 1, STAR_POINTS).astype(int))

@@ -131,7 +131,7 @@ def with_structure(
     """The fit with the effect of the structure of field points on its parameters in their covariance.
 
     With J = QR the parameters take up R⁻¹QᵀA of the amplitudes, so that τ² R⁻¹BBᵀR⁻ᵀ is added. `design` may be of a
-    sample of so many `points`: structure then counts by their share, as noise does.
+    sample of the field points, of which the set has `points`: structure then counts by their share, as noise does.
     """
     rows, size = design.jacobian.shape
     added, places = np.zeros((size, size)), 1
