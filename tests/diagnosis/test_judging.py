@@ -285,3 +285,16 @@ def test_patterns_of_the_optics_predict_settings_that_they_have_not_seen():
     calset = simulate(PLAN, seed=1, effects=[hidden]).calset
     optics = Design.of(fit(Likelihood.of(calset, base_model(calset))))
     assert refits.predicts_unseen(optics, vectors(optics))
+
+
+def test_units_that_all_gain_are_no_chance_however_much_two_of_them_gain():
+    """Gains of 5 and two of a thousand: by their mean they are less than 2 standard errors above 0."""
+    rng = np.random.default_rng(2)
+    gain = np.append(5.0 + rng.standard_normal(28), [900.0, 1100.0])
+    assert gain.mean() < 2.0 * gain.std(ddof=1) / np.sqrt(len(gain))
+    assert refits._gained(gain) > 4.5
+    # Σ rank / √Σ rank² = √(3 n (n + 1) / (2 (2 n + 1))) where all are above 0.
+    assert refits._gained(gain) == pytest.approx(np.sqrt(1.5 * 30 * 31 / 61))
+    assert refits._gained(-gain) < 0.0
+    noise = [refits._gained(rng.standard_normal(30)) for _ in range(2000)]
+    assert np.mean(np.array(noise) > 2.0) < 0.05

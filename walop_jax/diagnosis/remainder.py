@@ -336,8 +336,8 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
     """The stated number that, were it wrong, explained the data better than names do, and whether it leaves only noise.
 
     The number comes in words, empty if there is none; numbers that are as probable are named together. `conditions` are
-    the `condition_scores` of `before`. If nothing was added (`after` is `before`), only a number that explains the data
-    is named.
+    the `condition_scores` of `before`. If nothing was added (`after` has the effects of `before`), only a number that
+    explains the data is named.
 
     The evidence of the names, ln B of `after` against `before`, is compared with the evidence of the number, which is
     fitted exactly: ½ (χ² − χ²_c) − ½ ln(1 + w² C̃ᵀC̃), w its prior width. So one number may be preferred to sixteen
@@ -345,7 +345,7 @@ def instead_of_names(conditions: Singles, before: FitResult, after: FitResult) -
     """
     if after.noise_scale != before.noise_scale:  # one scale of the errors, or χ² of both are not comparable
         after = fit(after.likelihood, start=after.values, noise_scale=before.noise_scale)
-    added = after is not before
+    added = after.model.effect_names != before.model.effect_names
     least, likely = log_evidence_ratio(before, after) if added else 0.0, list[tuple[float, str, bool]]()
     for current in conditions.alike[:_FITTED]:
         stated, size, result = current.stated, 0.0, before
