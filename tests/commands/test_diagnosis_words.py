@@ -58,6 +58,7 @@ def test_the_first_line_says_what_is_missing_where_and_how_large(found: Diagnosi
         "a dark spot in front of one camera, O2: depth 0.00600 ± 0.00050, x 0.110 ± 0.010 deg (blemish, probability "
         "0.97)"
     )
+    assert repr(spot) == f"Step({spot.in_words}; χ² 2000 → 1000)"
     shown = dataclasses.replace(found, steps=(dataclasses.replace(spot, choices={"camera": 2}),)).display()
     assert list(shown.rows[0][:3]) == ["blemish", "camera", "O2"]
     # √((0.001 s₀²)² + (0.004 s₁ s₀/√3)²) of s₀ = 0.7083 and s₁ = 0.9212; errors by hand in the same way.

@@ -443,7 +443,9 @@ def is_trusted(diagnosis: Diagnosis) -> bool:
 def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict, with the names and descriptions that were added."""
     names = (
-        "; ".join(c.text for c, *_ in step.descriptions) if step.descriptions else step.effect
+        "; ".join(dict.fromkeys(c.candidate for c, *_ in step.descriptions))
+        if step.descriptions
+        else step.effect
         for step in diagnosis.steps
     )
     return f"{diagnosis.verdict} {', '.join(names)}".strip()

@@ -210,6 +210,10 @@ class Step(FitComparison):
     about: str = ""
     probability: float = float("nan")
 
+    def __repr__(self) -> str:
+        """What it says, in one line: its residuals are arrays of the size of the data."""
+        return f"Step({self.in_words}; χ² {self.chi2_before:.4g} → {self.chi2_after:.4g})"
+
     @property
     def shown(self) -> dict[str, tuple[float, float, str]]:
         """The parameters for a reader: a smooth field has one row, its rms over the field, and not its terms."""
