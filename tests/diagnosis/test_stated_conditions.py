@@ -391,7 +391,8 @@ def test_the_error_at_the_limit_is_that_of_a_fit_that_is_misled():
     """q and u off by as much as the matrix of a fit to noiseless counts with X wrong by its limit, to a fifth."""
     right = small_fit()
     calset = right.calset
-    limits = condition_limits(Design.of(small_fit_stating(position=3600.0)))
+    design = Design.of(small_fit_stating(position=3600.0))
+    limits = condition_limits(design, Singles.of(design))
     limit = next(one for one in limits if one.what.startswith("Y of all"))
     misled = refit(moved(calset, calset.points.x, calset.points.y + limit.detected), right.model)
 
