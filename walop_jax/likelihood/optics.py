@@ -77,6 +77,10 @@ class Directions:
 
     def seeds(self, parameters: int, sizes: Float[Any, " o"]) -> Float[Any, "c n"]:
         """The directions (c, n) as changes of all parameters: p_k / Σ p_k² where patterns have `sizes` p, else 1."""
+        if isinstance(sizes, np.ndarray):  # no patterns: the directions are known before anything is traced
+            seeds = np.zeros((self.count, parameters))
+            seeds[self.colour, self.index] = 1.0
+            return seeds
         squares = jnp.zeros(len(sizes)).at[self.family].add(sizes**2)[self.family]
         along = jnp.where(squares > 0.0, sizes / jnp.where(squares > 0.0, squares, 1.0), 0.0)
         return jnp.zeros((self.count, parameters)).at[self.colour, self.index].set(along)
@@ -140,7 +144,7 @@ def _slopes(
         return light.band_rows(with_values(instrument)(values), plan, x, y)
 
     shares = sizes[:, None] * along.reached
-    return along, shares, *derivatives(rows, (values,), (along.seeds(values.size, sizes),))
+    return along, shares, *derivatives(rows, (values,), (jnp.asarray(along.seeds(values.size, sizes)),))
 
 
 @jax.custom_jvp
