@@ -474,8 +474,8 @@ def held_out(design: Design, scheme: str) -> float:
         others, r = np.delete(unit, rows, axis=0), np.delete(design.residual, rows)
         step = -np.linalg.solve(others.T @ others + ridge, others.T @ r)
         error = design.residual[rows] + unit[rows] @ step
-        open_to_it = bare[rows].T @ error
-        squares[k] = error @ error - open_to_it @ np.linalg.solve(whole, open_to_it)
+        pull = bare[rows].T @ error
+        squares[k] = error @ error - pull @ np.linalg.solve(whole, pull)
     return float(squares.sum() / len(fold)) * design.fit.noise_scale**2
 
 

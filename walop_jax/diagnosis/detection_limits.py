@@ -12,9 +12,9 @@ Named       A rival that does its best to follow the effect stays √S ε from i
 Protection  A calibration without the effect takes up a part of it: δθ = (JᵀJ)⁻¹JᵀC ε. Stars are seen through
             m + ε ∂m/∂ε and calibrated with m + δθ ∂m/∂θ; the difference at the amplitude that is just detected, or
             at its prior width where this is smaller, is the largest error of q and u that the effect can make without
-            being noticed. On the map each effect has a
-            tenth on top (`SECOND_ORDER`): scattered light that is just detected does up to 8 % more than this. What
-            could hide, in a sentence and in the table, is that of `calibration.could_hide`, as for any calibration.
+            being noticed. On the map each effect has a tenth on top (`SECOND_ORDER`): scattered light that is just
+            detected does up to 8 % more than this. What could hide, in a sentence and in the table, is that of
+            `calibration.could_hide`, as for any calibration.
 
 Conditions  A number c that the set states of itself and that is wrong by h is found where h² G reaches the
             noncentrality of the test of `stated_conditions`. Stars are calibrated with a matrix that is off by

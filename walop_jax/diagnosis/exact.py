@@ -340,8 +340,7 @@ def other_descriptions(
     """Fits of other descriptions of the instrument, and all comparisons (`Choice`) by the text of the change.
 
     All changes are compared, and the best of them fitted as long as `allowed` is true of the number of fits so far.
-    `earlier` are comparisons made
-    before the last names joined the model.
+    `earlier` are comparisons made before the last names joined the model.
     """
     template, hopeless = dataclasses.replace(result.model.template, effects=()), set[str]()
     if OtherDescription.name in result.model.effect_names:

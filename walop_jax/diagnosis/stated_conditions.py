@@ -53,9 +53,7 @@ _ONE_STAR = "a bright star in one beam: its light in the other cameras"
 _PLACES = {"x", "gap"}  # shapes of which there are so many that an effect is as good as a pattern
 _PRECESSION = 46.124 / 3600.0, 20.043 / 3600.0  # deg a year, m, n, J2000: Capitaine et al. 2003, A&A 412, 567
 _J2000 = 51544.5  # MJD
-STEP = (
-    1e-4  # of the width: a one-sided derivative is wrong by a share of this size, a central one by its square
-)
+STEP = 1e-4  # of the width: it is the error of a one-sided derivative; that of a central one is its square
 
 
 class Stated(NamedTuple):
@@ -171,8 +169,8 @@ def _without_noise(design: Design, singles: Sequence[Single]) -> tuple[list[Sing
     """Numbers that may be asked, and those whose column holds the noise of the data itself.
 
     One number takes up one degree of freedom. If it takes up most of the residuals, and leaves far less than noise, its
-    column was made of the data.
-    A level of the sky that was computed from N would explain every residual, and by that every other number as well.
+    column was made of the data. A level of the sky that was computed from N would explain every residual, and by that
+    every other number as well.
     """
     residual, free = design.projector(design.residual), design.projector.free
     square, asked, noise = float(residual @ residual), list[Single](), list[Single]()

@@ -30,9 +30,8 @@ MOST_STEPS = 6  # things that are missing at once; additions of one diagnosis
 MOST_SENTENCES = 2
 MOST_TOGETHER = 4  # numbers of one thing that are tried together: members of a group of descriptions, priors
 MOST_FITTED = 4  # shapes of one effect from which it is fitted; other descriptions that are fitted
-LINEAR_GOOD = (
-    1.0  # ln B by which the linear step of a candidate reported as indistinguishable may be too small
-)
+# ln B by which the linear step of a candidate that is reported as indistinguishable may be too small.
+LINEAR_GOOD = 1.0
 # Relative change of the counts up to which linear steps are right: columns of an earlier model serve again, of
 # discrete causes only readings of some exposures are asked, and the evidence of a linear step is known to this share.
 LINEAR = 0.01

@@ -73,7 +73,7 @@ class Directions:
             return np.ones(len(self.index))
         value = values_at(AtPoint(x, y))
         sizes = (math.prod(value(text, self.units) for text in texts) for texts in self.patterns)
-        return jnp.stack([jnp.asarray(size, float) + 0.0 * x for size in sizes])
+        return jnp.stack([jnp.asarray(size, float) for size in sizes])
 
     def seeds(self, parameters: int, sizes: Float[Any, " o"]) -> Float[Any, "c n"]:
         """The directions (c, n) as changes of all parameters: p_k / Σ p_k² where patterns have `sizes` p, else 1."""

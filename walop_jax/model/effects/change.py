@@ -341,21 +341,19 @@ def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     return instrument
 
 
-def product(factors: Iterable[FactorLike], at: Any, units: Units) -> Any:
-    """Product of factors, 1 without any."""
-    values = (factor(item).value(at, units) if isinstance(item, str) else item(at) for item in factors)
+def product(
+    factors: Iterable[FactorLike], at: Any, units: Units, value: Callable[[str, Units], Any] | None = None
+) -> Any:
+    """Product of factors, 1 without any; `value` knows those with a text at `at` (`values_at`)."""
+    value = value or (lambda text, units: factor(text).value(at, units))
+    values = (value(item, units) if isinstance(item, str) else item(at) for item in factors)
     return functools.reduce(operator.mul, values, 1.0)
 
 
 def with_factors(terms: Iterable[Term], at: Any) -> list[tuple[Change, Any]]:
     """The changes with amplitude × factors at `at`; a factor that several changes have is computed once."""
     value = values_at(at)
-
-    def size_of(change: Change, amplitude: Scalar) -> Any:
-        values = (value(f, change.units) if isinstance(f, str) else f(at) for f in change.factors)
-        return amplitude * functools.reduce(operator.mul, values, 1.0)
-
-    return [(change, size_of(change, amplitude)) for change, amplitude in terms]
+    return [(change, size * product(change.factors, at, change.units, value)) for change, size in terms]
 
 
 def add(size: Scalar) -> Any:

@@ -69,11 +69,11 @@ def _ring(at: Any, units: Units, degree: str) -> Any:
 def _smooth(at: Any, units: Units, i: str, j: str) -> Any:
     """The term P_i(X/h) P_j(Y/h) of a smooth field, times its standard deviation beforehand (`smooth_deviations`)."""
     of_x, of_y = (legendre.polynomial(int(degree), t / units.field) for degree, t in ((i, at.x), (j, at.y)))
-    return _deviation(i, j) * of_x * of_y
+    return _term(i, j, of_x, of_y)
 
 
-def _deviation(i: str, j: str) -> float:
-    return smooth_deviations()[int(i)] * smooth_deviations()[int(j)]
+def _term(i: str, j: str, of_x: Any, of_y: Any) -> Any:
+    return smooth_deviations()[int(i)] * smooth_deviations()[int(j)] * of_x * of_y
 
 
 def _wave(at: Any, _: Units, wave: str, order: str, prefix: str) -> Any:
@@ -274,6 +274,6 @@ def values_at(at: Any) -> Callable[[str, Units], Any]:
             return item.value(at, units)
         of_x, of_y = polynomials(units)
         i, j = item.given
-        return _deviation(i, j) * of_x[int(i)] * of_y[int(j)]
+        return _term(i, j, of_x[int(i)], of_y[int(j)])
 
     return value
