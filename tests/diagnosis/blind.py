@@ -18,6 +18,7 @@ import functools
 import hashlib
 import itertools
 import json
+import math
 import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -87,6 +88,7 @@ class Verdict:
     amplitudes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     covariance: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     added: tuple[str, ...] = ()  # probes
+    probability: float = 1.0  # of the names together, each among all names of its thing
 
 
 # What each shape outside the catalogue is in sentences, with a blank at the end: from or to any time; none: no sentence
@@ -363,7 +365,10 @@ class Blind:
             classes.append(frozenset(told - {name, item.probe.name}))
         missing = last.alarm or len(said) > thresholds.MOST_SENTENCES
         kind = "unexplained" if missing else "effect_found" if named else "consistent"
-        verdict = Verdict(kind, tuple(named), tuple(classes), tuple(said), added=tuple(added))
+        likely = math.prod(trial.probability for trial, _ in judge.adoptions)
+        verdict = Verdict(
+            kind, tuple(named), tuple(classes), tuple(said), added=tuple(added), probability=likely
+        )
         if first is None:
             return verdict, last
         score = first.score

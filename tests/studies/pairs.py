@@ -25,25 +25,11 @@ sys.path[:0] = [
     *(str(ROOT / "tests" / p) for p in (".", "diagnosis", "studies", "studies/benchmark")),
 ]
 
-from blind import SEPARABLE, Blind, Cached, Scene  # noqa: E402
+from blind import SEPARABLE  # noqa: E402
 from generate import Layout  # noqa: E402
 from study_options import options_of  # noqa: E402
 
-from walop_jax.diagnosis.search import State, search  # noqa: E402
 from walop_jax.diagnosis.selection import most_probable  # noqa: E402
-
-
-def answered(blind: Blind, scene: Scene) -> tuple[list[str], set[str], float]:
-    """The names that are added, these and those of their classes, and the probability that the posterior gives them."""
-    judge = Cached(blind._spaces, scene.removed)
-    last = search(State(blind.start(scene)), judge).evidence
-    names, held, probability = [], set[str](), most_probable(last).nothing_more
-    for trial, before in judge.adoptions:
-        assert trial.item is not None
-        names.append(trial.name)
-        held |= {trial.name, *trial.rivals, *trial.nameless, *before.close(trial.item)}
-        probability *= trial.probability
-    return names, held, probability
 
 
 def main() -> None:
@@ -55,10 +41,12 @@ def main() -> None:
     rows = []
     for number in range(options.pairs):
         scene = blind.pair(options.ratio)
-        names, held, probability = answered(blind, scene)
-        truth = set(scene.truth)
-        right, inside = sorted(names) == sorted(truth), truth <= held
-        rows.append((right, inside, len(set(names) - truth), probability, scene.separation >= SEPARABLE))
+        verdict, last = blind.judged(scene, blind.start(scene))
+        names, probability = verdict.named, verdict.probability * most_probable(last).nothing_more
+        right = sorted(names) == sorted(scene.truth)
+        inside = set(scene.truth) <= set(names).union(*verdict.classes)
+        false = sum(name not in scene.truth for name in names)
+        rows.append((right, inside, false, probability, scene.separation >= SEPARABLE))
         if not right:
             print(
                 f"{number}: {' and '.join(scene.truth)}: {', '.join(names)} ({probability:.2f})", flush=True
