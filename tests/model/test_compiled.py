@@ -6,6 +6,7 @@ import types
 from pathlib import Path
 
 import builders
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +68,28 @@ def test_compiled_is_the_function_itself():
     quick = compiled(area)
     assert float(quick(jnp.asarray(3.0), jnp.asarray(2.0))) == 6.0
     assert (quick.__name__, quick.__doc__) == ("area", "What a rectangle covers.")
+
+
+class Amount(eqx.Module):
+    """Work that is asked for."""
+
+    work: int
+
+
+@pytest.mark.parametrize(("works", "programs"), [((100, 1), 1), ((1, 100), 2), ((1, 2), 1)])
+def test_an_optimised_program_serves_little_work_as_well(monkeypatch, works, programs):
+    """What is there already is not compiled a second time without optimisation."""
+    made, jit = [], jax.jit
+
+    def counted(function, **options):
+        made.append(options)
+        return jit(function, **options)
+
+    doubled = compiled(lambda amount, x: 2.0 * x, optimised_above=10)
+    knows("xla_cpu_use_fusion_emitters")  # asked once in a process, by a program of its own
+    monkeypatch.setattr(jax, "jit", counted)
+    assert [float(doubled(Amount(work), jnp.arange(3.0))[1]) for work in works] == [2.0, 2.0]
+    assert len(made) == programs
 
 
 def test_methods_of_components_are_plain():

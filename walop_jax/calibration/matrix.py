@@ -177,7 +177,7 @@ def _slopes_at(
 
 
 _vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
-_slopes = compiled(_slopes_at, kept_as="slopes")  # of hundreds of places after every fit
+_slopes = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes")
 
 
 def analysis_vectors(
@@ -197,6 +197,7 @@ def vector_slopes(
     instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "p d b k 3"]:
     """Derivatives (p, d, b, k, 3) of `sky_vectors`: in all parameters but the series, then in the throughputs there."""
+    plan = dataclasses.replace(plan, work=len(x))
     return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
 

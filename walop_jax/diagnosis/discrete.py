@@ -220,13 +220,14 @@ def _stated_otherwise(likelihood: Likelihood, left: float, values: Vector) -> tu
 
 def _few(calset: CalibrationSet, model: Model) -> Likelihood | None:
     """The likelihood of a set at the few field points that are looked at; None where no light was seen there."""
-    # The program that a small set was fitted with is there already.
-    few = calset if len(calset.points) <= FEW else thinned(calset, _POINTS, neighbours=1)
+    points = len(calset.points)
+    few = calset if points <= FEW else thinned(calset, _POINTS, neighbours=1)
     block = few.intensities.block(0, len(few.points))
     if not (block.used[..., None] & (block.counts > 0)).any():
         return None
     few = dataclasses.replace(few, intensities=TableIntensities.dense(few.points, block))
-    return Likelihood.of(few, model)
+    # The whole set is fitted as well: one program serves both.
+    return Likelihood.of(few, model, sets=-(-points // len(few.points)))
 
 
 def _most_missed(likelihood: Likelihood, values: Vector) -> float:

@@ -239,6 +239,7 @@ def compiled(
     """`jax.jit` with this package's options; the back end is looked up at the first call, not at import.
 
     Code for a `Plan` whose `work` is not above `optimised_above` is not optimised: faster to compile, slower to run.
+    Where an optimised program for such arguments is there already, it serves them as well.
     `fuse` leaves the fusion emitters on, for a function without derivatives of the plates. `kept_as` names the traced
     program between processes (`program`), for a function of its arguments alone.
     """
@@ -258,24 +259,25 @@ def compiled(
 
     programs: dict[Any, Any] = {}
 
-    def kept(args: tuple[Any, ...], once: bool) -> Any:
-        """The kept program for arguments like these, from disk if possible; None where it cannot be kept."""
-        directory = folder()
-        if directory is None:
-            return None
+    def run_for(args: tuple[Any, ...], once: bool) -> Any:
+        """The program for arguments like these: a kept one if possible, from disk if it is there."""
+        directory = folder() if kept_as else None
+        if directory is None and optimised_above < 0:  # no choice, and nothing to look up
+            return jitted(False)
         leaves, tree = jax.tree.flatten(args)
-        at = tree, tuple(kind(leaf) for leaf in leaves), once
-        if at not in programs:
-            programs[at] = program(directory, kept_as, function, args, options(once))
-        return programs[at]
+        at = directory, tree, tuple(kind(leaf) for leaf in leaves)
+        once = once and (*at, False) not in programs
+        if (*at, once) not in programs:
+            stored = directory and program(directory, kept_as, function, args, options(once))
+            programs[*at, once] = stored or jitted(once)
+        return programs[*at, once]
 
     @functools.wraps(function)
     def call(*args: Any) -> Result:
         _refuse_float32(args)
         once = optimised_above >= 0 and any(getattr(arg, "work", np.inf) <= optimised_above for arg in args)
         with float64():
-            run = (kept(args, once) if kept_as else None) or jitted(once)
-            return run(*args)
+            return run_for(args, once)(*args)
 
     return call
 
