@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_run import small_fit
 
 from walop_jax.data.settings import Settings
 from walop_jax.likelihood import optics
+from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled
 from walop_jax.model.effects import effect_by_name
@@ -102,3 +104,25 @@ def test_local_derivatives_go_through_the_series():
     same = optics.through_series(jnp.asarray(local), jnp.asarray(basis))
     assert isinstance(same, jax.Array)
     np.testing.assert_allclose(same, found, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("interpolate", [False, True])
+def test_one_pass_gives_residuals_and_their_derivatives(interpolate):
+    """29 points in two batches; where optics are interpolated the residuals are those of the interpolation.
+
+    The derivatives make the gradient of χ².
+    """
+    result = small_fit()
+    likelihood = Likelihood.of(result.calset, result.model, batch=16, interpolate=interpolate)
+    flux, residual, jacobian = likelihood.linearised(result.values)
+    fluxes, residuals = likelihood.residuals(result.values)
+    np.testing.assert_allclose(flux, fluxes, rtol=1e-12)
+    np.testing.assert_allclose(residual, residuals, atol=1e-9)
+    # Away from the minimum, where χ² has a slope; that of the projected residuals is exact (Golub & Pereyra 1973).
+    moved = result.values + 3.0 * result.sigma
+    _, residual, jacobian = likelihood.linearised(moved)
+    gradient = jacobian.T @ residual[likelihood.used].reshape(-1)
+    for k, position in ((k, result.model.free[k]) for k in (0, 7, 40)):
+        step = 1e-3 * result.sigma * (np.arange(len(moved)) == position)
+        above, below = (np.sum(likelihood.residuals(moved + sign * step)[1] ** 2) for sign in (1, -1))
+        assert gradient[k] == pytest.approx((above - below) / (4.0 * step[position]), rel=1e-5)

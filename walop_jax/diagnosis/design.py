@@ -88,14 +88,22 @@ STATES = "states"
 
 
 class Measured:
-    """The measurements at a best fit, laid out for building columns of residual derivatives."""
+    """The measurements at a best fit, laid out for building columns of residual derivatives.
 
-    def __init__(self, likelihood: Likelihood, values: Float[np.ndarray, " n"]) -> None:
+    `found` are the fluxes and residuals at the `values`, if they are known (`Likelihood.residuals`).
+    """
+
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        values: Float[np.ndarray, " n"],
+        found: tuple[Float[np.ndarray, "p e"], ResidualCube] | None = None,
+    ) -> None:
         self.likelihood, self.values = likelihood, values
         self.weight: ResidualCube = likelihood.points.gathered("weight")
         self.counts: ResidualCube = likelihood.points.gathered("counts")
         self.used: Bool[np.ndarray, "p e"] = likelihood.used
-        self.flux, self.residual = likelihood.residuals(values)
+        self.flux, self.residual = found or likelihood.residuals(values)
         self.shared = likelihood.flux_groups
         # Weighted model at unit flux, from data = flux · model + residual.
         flux = np.where(self.flux == 0, 1.0, self.flux)[..., None]
@@ -125,6 +133,11 @@ class Measured:
         """Derivative with respect to the amplitude of a change of the counts in standard errors: fluxes follow it."""
         projected = project_flux(change, self.model, self.known, self.shared)
         return -projected[self.used].reshape(-1)
+
+    @cached_property
+    def columns(self) -> Columns:
+        """Columns of changes of the instrument at these values, which need the responses of the whole light path."""
+        return Columns(self.likelihood, self.values)
 
     @property
     def has_gains(self) -> bool:
@@ -324,31 +337,39 @@ def strata(measured: Measured) -> Iterator[_Stratum]:
 class Design:
     """Residuals r (data − model, whitened) and J = ∂r/∂θ of the free parameters at a fit; priors are the last rows.
 
-    The rows of the data run over points, then exposures, then cameras, used ones only.
+    The rows of the data run over points, then exposures, then cameras, used ones only. `served_by` are the measurements
+    at another fit of the same data, which expects nearly the same counts: its columns serve here as well. None: the fit
+    has columns of its own.
     """
 
     fit: FitResult
     measured: Measured
     residual: AnyVector
     jacobian: Float[np.ndarray, "_ _"]
+    served_by: Measured | None = None
 
     @classmethod
     def of(cls, fit: FitResult) -> Design:
         """Lay out a fit."""
         likelihood = fit.likelihood
-        measured = Measured(likelihood, fit.values)
+        *found, slope = likelihood.linearised(fit.values)
+        measured = Measured(likelihood, fit.values, (found[0], found[1]))
         scale = fit.noise_scale
-        data = measured.residual[measured.used].reshape(-1) / scale
-        slope = likelihood.jacobian(fit.values) / scale
+        data, slope = measured.residual[measured.used].reshape(-1) / scale, slope / scale
         # Data − model: priors stand in for data, so their rows are mean − value.
         prior = -likelihood.priors.residuals(fit.values)
         prior_slope = -likelihood.priors.jacobian(fit.model.selection())
         return cls(fit, measured, np.concatenate([data, prior]), np.vstack([slope, prior_slope]))
 
-    @cached_property
+    @property
+    def origin(self) -> Measured:
+        """The measurements at the fit whose columns are used."""
+        return self.served_by or self.measured
+
+    @property
     def columns(self) -> Columns:
         """Columns of changes that the model does not include."""
-        return Columns(self.fit.likelihood, self.fit.values)
+        return self.origin.columns
 
     @property
     def rows(self) -> int:

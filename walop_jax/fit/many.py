@@ -402,8 +402,8 @@ def _equations_of_many(stack: Stack, values: Float[Array, "s n"]) -> NormalEquat
     def one(given: tuple[Sequence[Array], Array]) -> NormalEquations:
         varying, at = given
         template, plan, data = stack.tree(varying)
-        residual, slope = engine.residuals_and_slopes(with_values(template)(at), plan, data)
-        r, jacobian = residual.reshape(-1), slope.reshape(-1, at.size)
+        found = engine.residuals_and_slopes(with_values(template)(at), plan, data)
+        r, jacobian = found.residual.reshape(-1), found.slope.reshape(-1, at.size)
         return NormalEquations(r @ r, jacobian.T @ r, jacobian.T @ jacobian)
 
     # One after the other on a CPU, whose cache holds the Jacobian of one set; side by side where there are many cores.

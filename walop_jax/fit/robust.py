@@ -91,10 +91,9 @@ def _gradients(likelihood: Likelihood, values: Vector) -> Iterator[tuple[str, Fl
     by_exposure = np.zeros((len(calset.exposures), select.shape[1]))
     by_cell, first = np.zeros((int(cell.max(initial=0)) + 1, select.shape[1])), 0
     for batch in likelihood.points:
-        arrays = engine.linearised_residuals(instrument, likelihood.plan, batch)
-        residual, slope = (np.asarray(item) for item in arrays)
-        residual = residual.reshape(batch.counts.shape)
-        rows = slope.reshape(*residual.shape, -1)
+        found = engine.linearised_residuals(instrument, likelihood.plan, batch)
+        residual = np.asarray(found.residual).reshape(batch.counts.shape)
+        rows = np.asarray(found.slope).reshape(*residual.shape, -1)
         # Points that fill the last batch have no weight, and so no gradient.
         gradients = np.einsum("pekn,pek->pen", rows, residual) @ select
         by_exposure += gradients.sum(axis=0)

@@ -221,8 +221,8 @@ def unit_slopes(instrument: Instrument, plan: Plan, point: PointData) -> tuple[C
 
 def _point_jacobian(
     instrument: Instrument, plan: Plan, point: PointData, nodes: Nodes = None
-) -> tuple[Float[Array, " d"], Float[Array, "l d"]]:
-    """Residuals of one point and their derivatives with respect to its local quantities.
+) -> tuple[Float[Array, " d"], Float[Array, "l d"], Flux]:
+    """Residuals of one point, their derivatives with respect to its local quantities, and the best flux.
 
     Local quantities are all parameters but the series, then the throughputs of its sites; d runs over
     exposures and cameras.
@@ -246,7 +246,7 @@ def _point_jacobian(
     shared = flux_groups(instrument, plan, point)
     projected = project_flux(d_counts * point.weight, along * point.weight, plan.exposures.flux_known, shared)
     residual = shared.independent((point.counts - counts) * point.weight)
-    return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1)
+    return residual.reshape(-1), -projected.reshape(d_counts.shape[0], -1), flux
 
 
 def normal_equations(
@@ -264,8 +264,8 @@ def normal_equations(
         rows = slice(start, start + limits.BATCH)
         few = len(data.x) <= limits.BATCH
         points = data if few else jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], data)
-        residual, slope = map(np.asarray, linearised_residuals(instrument, plan, points))
-        r, jacobian = residual.reshape(-1), slope.reshape(-1, size)
+        found = linearised_residuals(instrument, plan, points)
+        r, jacobian = np.asarray(found.residual).reshape(-1), np.asarray(found.slope).reshape(-1, size)
         chi2, gradient, matrix = chi2 + r @ r, gradient + jacobian.T @ r, matrix + jacobian.T @ jacobian
     return NormalEquations(chi2, gradient, matrix)
 
@@ -300,7 +300,7 @@ def _block_equations(
 
     def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
         """χ², Jᵀr and JᵀJ in its local quantities."""
-        r, jacobian = _point_jacobian(instrument, plan, point, nodes)
+        r, jacobian, _ = _point_jacobian(instrument, plan, point, nodes)
         return r @ r, jacobian @ r, jacobian @ jacobian.T
 
     chi2, gradient, gram = jax.vmap(of_point)(data)
@@ -328,15 +328,21 @@ def _residuals(
     return jax.vmap(point_residuals, in_axes=(None, None, 0, None))(instrument, plan, data, nodes)
 
 
-def residuals_and_slopes(
-    instrument: Instrument, plan: Plan, data: PointData
-) -> tuple[Float[Array, "p d"], Float[Array, "p d n"]]:
-    """All residuals (p, d) and their derivatives (p, d, n) in all parameters; d runs over exposures, then cameras."""
-    residual, local = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
+class Linearised(NamedTuple):
+    """Residuals of points and their derivatives in all parameters, and the best fluxes; d: exposures, then cameras."""
+
+    residual: Float[Any, "p d"]
+    slope: Float[Any, "p d n"]
+    flux: Float[Any, "p e f"]
+
+
+def residuals_and_slopes(instrument: Instrument, plan: Plan, data: PointData) -> Linearised:
+    """All residuals, their derivatives, and the best fluxes."""
+    residual, local, flux = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size
     spread = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))
-    return residual, spread(local, basis)
+    return Linearised(residual, spread(local, basis), flux)
 
 
 def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -211,8 +211,8 @@ class Likelihood(ShortDir):
     """
 
     _working = (
-        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "light", "nodes",
-        "points", "points_as_stated", "runner", "taken", "weak", "with_errors_at",
+        "of", "counted", "data_terms", "errors_at", "expanded", "fits_errors", "following", "layout", "light",
+        "linearised", "nodes", "points", "points_as_stated", "runner", "taken", "weak", "with_errors_at",
     )  # fmt: skip
 
     layout: Layout
@@ -478,8 +478,16 @@ class Likelihood(ShortDir):
         instrument = self.model.instrument(values)
         nodes, _ = self.nodes(instrument)
         batches = [engine.residuals(instrument, self.plan, batch, nodes) for batch in self.points]
-        flux, residual = (np.concatenate(arrays) for arrays in zip(*batches, strict=True))
-        return flux[: self.layout.points].mean(axis=-1), residual[: self.layout.points]
+        return self._of_points(batches)
+
+    def _of_points(
+        self, batches: Sequence[tuple[Any, Any]]
+    ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"]]:
+        """Fluxes and residuals of all points from those of the batches, the last of which is filled up."""
+        flux, residual = (
+            np.concatenate(arrays)[: self.layout.points] for arrays in zip(*batches, strict=True)
+        )
+        return flux.mean(axis=-1), residual
 
     def light_at(self, values: Vector) -> Float[np.ndarray, "p e k"]:
         """F u/N_ERR of all intensities at a full vector of values, with the errors of these values; 0 where unused."""
@@ -508,16 +516,28 @@ class Likelihood(ShortDir):
         shared = engine.flux_groups(self.model.template, self.plan)
         return log_variance(ratio, light, self.flux_known, shared)
 
+    def linearised(
+        self, values: Vector
+    ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"], Float[np.ndarray, "d f"]]:
+        """Best fluxes and residuals, as `residuals` gives them, and the derivatives of `jacobian`."""
+        if self.fits_errors:
+            return self.with_errors_at(values).linearised(values)
+        instrument, select = self.model.instrument(values), self.model.selection()
+        found, jacobian = [], []
+        for batch in self.points:
+            linear = engine.linearised_residuals(instrument, self.plan, batch)
+            jacobian.append(used_rows(linear.slope, batch) @ select)
+            found.append((np.asarray(linear.flux), np.asarray(linear.residual).reshape(batch.weight.shape)))
+        if self.layout.interpolated:  # the optics of residuals come from nodes
+            return *self.residuals(values), np.concatenate(jacobian)
+        return *self._of_points(found), np.concatenate(jacobian)
+
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense.
 
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
-        if self.fits_errors:
-            return self.with_errors_at(values).jacobian(values)
-        instrument, select = self.model.instrument(values), self.model.selection()
-        slopes = ((engine.linearised_residuals(instrument, self.plan, c)[1], c) for c in self.points)
-        return np.concatenate([used_rows(slope, batch) @ select for slope, batch in slopes])
+        return self.linearised(values)[2]
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors (p, e, 4) of the light that enters the instrument, per unit of flux."""

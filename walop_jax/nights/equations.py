@@ -137,9 +137,9 @@ def with_candidates(
     select = np.hstack([model.selection(), np.eye(len(model.names))[:, at]])
     residuals, slopes = [], []
     for batch in likelihood.points:
-        residual, slope = engine.linearised_residuals(instrument, likelihood.plan, batch)
-        residuals.append(used_rows(residual[..., None], batch)[:, 0])
-        slopes.append(used_rows(slope, batch) @ select)
+        found = engine.linearised_residuals(instrument, likelihood.plan, batch)
+        residuals.append(used_rows(found.residual[..., None], batch)[:, 0])
+        slopes.append(used_rows(found.slope, batch) @ select)
     r, jacobian = np.concatenate(residuals), np.concatenate(slopes)
     if changes:
         cut = len(model.free)
