@@ -5,16 +5,19 @@ import dataclasses
 
 import numpy as np
 import pytest
+from fits_with import examined_with, fit_with, set_with
 from small_run import small_fit
 
-from walop_jax.diagnosis import trust
+from walop_jax.diagnosis import thresholds, trust
 from walop_jax.diagnosis.design import Design
 from walop_jax.diagnosis.examination import Examination, examine
 from walop_jax.diagnosis.grammar import hypotheses
+from walop_jax.diagnosis.hypotheses import Hypotheses
 from walop_jax.diagnosis.score import corrected_p
 from walop_jax.diagnosis.trust import candidate_scores
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import EFFECTS
+from walop_jax.model.effects.change import Change
 
 
 def test_a_fit_and_a_diagnosis_score_alike():
@@ -63,3 +66,21 @@ def test_columns_serve_again_while_the_expected_counts_hardly_change(factor, lik
     earlier = object.__new__(Examination)
     vars(earlier)["design"] = design
     assert earlier.is_like(dataclasses.replace(design, measured=measured)) == like
+    # Columns that come from another fit are as old as that fit.
+    vars(earlier)["design"] = dataclasses.replace(design, measured=measured, served_by=design.measured)
+    assert earlier.is_like(design)
+    assert earlier.is_like(dataclasses.replace(design, measured=measured)) == like
+
+
+def test_columns_of_a_fit_that_expects_the_same_are_its_own_to_that_accuracy():
+    """A retarder of 0.01 rad is found; the model with it is asked again with the columns of the model without it."""
+    text = "retardance q behind collimator"
+    calset = set_with(5, {text: 0.01})
+    earlier = examined_with(fit_with(calset))
+    later = examine(fit_with(calset, text), Hypotheses(), np.random.default_rng(0), earlier)
+    assert later.design.columns is earlier.design.columns
+    own = Design.of(later.result)
+    assert own.columns is not earlier.design.columns
+    asked = [[(1.0, Change.parsed(other))] for other in ("retardance u behind collimator", "gain of O1 * x")]
+    near, exact = later.design.columns.of(asked), own.columns.of(asked)
+    assert 0.0 < np.linalg.norm(near - exact) < 2.0 * thresholds.LINEAR * np.linalg.norm(exact)

@@ -382,7 +382,7 @@ class Examination(Evidence):
 
     def is_like(self, design: Design) -> bool:
         """True if another fit expects nearly the same counts, so that the columns of this one serve it as well."""
-        ours, theirs = (of.measured.counts_changed_by(GAIN) for of in (self.design, design))
+        ours, theirs = (of.counts_changed_by(GAIN) for of in (self.design.origin, design.measured))
         return bool(np.linalg.norm(ours - theirs) < thresholds.LINEAR * np.linalg.norm(ours))
 
 
@@ -405,6 +405,7 @@ def examine(
     known = earlier.synonyms if earlier is not None else {} if synonyms_apart else None
     again = earlier if earlier is not None and earlier.is_like(design) else None
     if again is not None:
+        design = dataclasses.replace(design, served_by=again.design.origin)
         computed = again.candidates
     elif computed is None:
         other_names = set(itertools.chain(*(known or {}).values()))

@@ -31,7 +31,6 @@ from walop_jax.diagnosis.search import Reason, Round, State
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.fit.robust import field_cells, states
 from walop_jax.io.progress import Stage
-from walop_jax.likelihood.columns import columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects import Described, Effect
 from walop_jax.model.instrument import Instrument
@@ -107,7 +106,7 @@ class Refits:
         result = evidence.result
         for end in (0, 1) if not further else ():
             if times := grammar.retimed(change, result.calset.exposures, end):
-                c = columns(result.likelihood, result.values, [[(1.0, one)] for one in times])
+                c = evidence.design.columns.of([[(1.0, one)] for one in times])
                 c = evidence.design.projector(evidence.design.stacked([c]))
                 along, square = c.T @ evidence.design.residual, np.sum(c**2, axis=0)
                 best = int(np.argmax(along**2 / np.where(square > 0, square, np.inf)))

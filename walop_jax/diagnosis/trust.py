@@ -81,14 +81,21 @@ NOISELESS = 1e-6
 """Squared residuals, beyond the reach of the parameters, of data that hold no noise: rounding, and second order."""
 
 
+class Diagnosed(NamedTuple):
+    """What a diagnosis has of a fit: the fit laid out with its columns, and the scores of what the model may lack."""
+
+    design: Design
+    candidates: ScoreTable
+
+
 def examined(
-    result: FitResult, seed: int = 0, *, as_written: bool = False, candidates: ScoreTable | None = None
+    result: FitResult, seed: int = 0, *, as_written: bool = False, diagnosed: Diagnosed | None = None
 ) -> FitResult:
     """The fit with the verdict on it: what its residuals say against it, beside χ², priors and convergence.
 
     A fit that does not explain its data is held against other readings of them (`discrete`), unless these were tried
     already (`as_written`), then against `remedies`: larger errors, rows left out, another value of a stated number.
-    `seed` is that of the Monte Carlo p, `candidates` the scores of its residuals in a diagnosis, if there was one.
+    `seed` is that of the Monte Carlo p, `diagnosed` what a diagnosis of the same fit has found already.
     Of a set with more than `TRUST_ROWS` (exposure, point) pairs, points spread over the field are looked at; cells of
     whole frames are joined to so many (`joined_cells`), and those spread over the field are asked what differs between
     places.
@@ -108,7 +115,10 @@ def examined(
     cures = () if near else _remedies(result, seen, seed)
     if cures:
         return result.with_verdict(remedies=cures)
-    design = Design.of(seen)
+    if diagnosed is not None and seen is result:
+        design = dataclasses.replace(diagnosed.design, fit=result)
+    else:
+        design = Design.of(seen)
     if result.errors_too_large and _hold_no_noise(design):
         return result.with_verdict(noiseless=True)
     places = design if seen is result or result.calset.fine is None else Design.of(_spread(result))
@@ -120,7 +130,7 @@ def examined(
     if near:
         singles = Singles.of(design)
         hidden = undetected_errors(design, singles)
-        candidates = candidates or candidate_scores(design, seed, singles)
+        candidates = diagnosed.candidates if diagnosed else candidate_scores(design, seed, singles)
         design.columns.forget()  # responses of a thousand points, ahead of the large matrices of the patterns
         doubts = (
             *stated_conditions(design, singles),

@@ -50,10 +50,9 @@ from walop_jax.diagnosis.remainder import (
     rival_conditions,
     wrong_number,
 )
-from walop_jax.diagnosis.score import ScoreTable
 from walop_jax.diagnosis.search import State, search
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
-from walop_jax.diagnosis.trust import examined
+from walop_jax.diagnosis.trust import Diagnosed, examined
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import NEARLY, FitResult, fit, with_empirical_covariance
 from walop_jax.fit.verdict import Quality
@@ -162,10 +161,10 @@ def diagnose(
         not_scored=_not_scored(catalogue, candidates, first.evidence.synonyms),
         descriptions=len(candidates.descriptions) + len(candidates.parts),
     )
-    tables = first.evidence.table, evidence.table
+    of_fits = [Diagnosed(of.design, of.table) for of in (first.evidence, evidence)]
     rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
-    return _examined(diagnosis, tables, rivals, seed)
+    return _examined(diagnosis, of_fits, rivals, seed)
 
 
 class _Searched(NamedTuple):
@@ -240,13 +239,14 @@ def _members(first: State, state: State, steps: Sequence[Step]) -> Questions:
 
 
 def _examined(
-    diagnosis: Diagnosis, tables: tuple[ScoreTable, ScoreTable], rivals: Sequence[str], seed: int
+    diagnosis: Diagnosis, of_fits: Sequence[Diagnosed], rivals: Sequence[str], seed: int
 ) -> Diagnosis:
     """A diagnosis with the verdicts on its fits, and the remarks on `rivals` of its names.
 
-    `tables` are the scores of the fits before and after.
+    `of_fits` is what was found of the fit before, and of the fit after the additions.
     """
-    after = examined(with_empirical_covariance(diagnosis.after), seed, as_written=True, candidates=tables[1])
+    result = with_empirical_covariance(diagnosis.after)
+    after = examined(result, seed, as_written=True, diagnosed=of_fits[1])
     for sentence in only_a_class(diagnosis.members):
         after = after.with_doubt(Quality.CLASS_ONLY, sentence)
     after = with_average(after, diagnosis.members)
@@ -258,7 +258,7 @@ def _examined(
     # If χ² contradicts the given model, its residuals are not examined: the steps name the missing effects.
     explained = before.explains_data or before.nearly_explains_data
     before = (
-        examined(before, seed, as_written=True, candidates=tables[0]) if explained else before.with_verdict()
+        examined(before, seed, as_written=True, diagnosed=of_fits[0]) if explained else before.with_verdict()
     )
     return dataclasses.replace(diagnosis, before=before, after=after)
 
