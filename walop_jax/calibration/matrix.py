@@ -177,7 +177,8 @@ def _slopes_at(
 
 
 _vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
-_slopes = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes")
+_slopes = compiled(_slopes_at, kept_as="slopes")  # of hundreds of places after every fit
+_slopes_once = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes")
 
 
 def analysis_vectors(
@@ -197,7 +198,6 @@ def vector_slopes(
     instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints
 ) -> Float[np.ndarray, "p d b k 3"]:
     """Derivatives (p, d, b, k, 3) of `sky_vectors`: in all parameters but the series, then in the throughputs there."""
-    plan = dataclasses.replace(plan, work=len(x))
     return _in_chunks(lambda a, b: _slopes(instrument, plan, a, b), x, y)[1]
 
 
@@ -229,13 +229,15 @@ def of_matrix(
     return (added[..., i, :] - added[..., j, :] - common) / total
 
 
-def _matrix_and_slopes(instrument: Instrument, plan: Plan) -> Callable[..., tuple[Matrices, Slopes]]:
+def _matrix_and_slopes(
+    instrument: Instrument, plan: Plan, program: Callable[..., Any] = _slopes
+) -> Callable[..., tuple[Matrices, Slopes]]:
     """A function of rows as those of `_slopes_at`: matrices in the one band of the plan, and their derivatives."""
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
     def at(*columns: OfPoints) -> tuple[np.ndarray, np.ndarray]:
-        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
+        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in program(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
         basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
         result = np.empty((*change.shape[:-1], size))
@@ -300,17 +302,26 @@ def matrix_draws(
 
 
 def matrix_slopes(
-    instrument: Instrument, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
+    instrument: Instrument,
+    setting: Settings,
+    filters: Filters,
+    x: OfPoints,
+    y: OfPoints,
+    *,
+    once: bool = False,
 ) -> tuple[Matrices, Slopes]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
-    `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
+    `setting` has one row. `once` says that hardly more than these places will be asked of a model with these effects,
+    such as one in the course of a diagnosis: few of them are not worth an optimised program. Raises KeyError for a
+    filter that `filters` does not hold.
     """
     if not instrument.cameras.pairs:  # no row, and nothing to compile
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    return _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
+    program = _slopes_once if once else _slopes
+    return _in_chunks(_matrix_and_slopes(instrument, plan, program), x, y, *numbers)
 
 
 def slopes_over_field(

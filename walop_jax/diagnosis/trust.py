@@ -129,7 +129,8 @@ def examined(
     hidden = singles = None
     if near:
         singles = Singles.of(design)
-        hidden = undetected_errors(design, singles)
+        # The product of a diagnosis has further effects.
+        hidden = undetected_errors(design, singles, once=diagnosed is not None)
         candidates = diagnosed.candidates if diagnosed else candidate_scores(design, seed, singles)
         design.columns.forget()  # responses of a thousand points, ahead of the large matrices of the patterns
         doubts = (

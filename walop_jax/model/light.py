@@ -234,8 +234,18 @@ def stokes(instrument: LightPath, illumination: PointIllumination) -> Float[Arra
     Light behind the polariser is independent of its source; only light from the sky passes the telescope.
     """
     instrument = instrument.patched()
-    exposures, x, y = illumination.exposures, illumination.x, illumination.y
+    light = through_sky_films(instrument, illumination, behind_telescope(instrument, illumination))
+    polariser, exposures = instrument.polariser, illumination.exposures
+    if polariser is None:
+        return light
+    at_polariser = polariser.light(exposures, illumination.x, illumination.y)
+    return jnp.where(exposures.clp_in[:, None], at_polariser, light)
+
+
+def behind_telescope(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
+    """Stokes vectors (e, 4) of the light of the sources behind the telescope, of an instrument without effects."""
     illumination = _turned(instrument, illumination)
+    exposures = illumination.exposures
     assigned = jnp.zeros(exposures.kind.shape, bool)
     qu = jnp.zeros((*assigned.shape, 2))
     for source in instrument.sources:
@@ -245,11 +255,7 @@ def stokes(instrument: LightPath, illumination: PointIllumination) -> Float[Arra
                 jnp.where(shining[:, None], source.polarisation(illumination), qu),
                 assigned | shining,
             )
-    light = _at_polariser(instrument, illumination, jnp.ones_like(exposures.clp_angle), qu)
-    polariser = instrument.polariser
-    if polariser is None:
-        return light
-    return jnp.where(exposures.clp_in[:, None], polariser.light(exposures, x, y), light)
+    return _through_telescope(instrument, illumination, jnp.ones_like(exposures.clp_angle), qu)
 
 
 def stokes_slopes(instrument: LightPath, illumination: PointIllumination) -> Float[Array, "e 4"]:
@@ -257,31 +263,35 @@ def stokes_slopes(instrument: LightPath, illumination: PointIllumination) -> Flo
     instrument = instrument.patched()
     exposures, illumination = illumination.exposures, _turned(instrument, illumination)
     dark = jnp.zeros_like(exposures.clp_angle)
-    light = _at_polariser(instrument, illumination, dark, instrument.standard.slope(illumination))
+    slope = instrument.standard.slope(illumination)
+    light = _through_telescope(instrument, illumination, dark, slope)
+    light = through_sky_films(instrument, illumination, light)
     return jnp.where(exposures.clp_in[:, None], 0.0, light)
 
 
-def _at_polariser(
+def _through_telescope(
     instrument: LightPath,
     illumination: PointIllumination,
     intensity: Float[Array, " e"],
     qu: Float[Array, "e 2"],
 ) -> Float[Array, "e 4"]:
-    """Stokes vectors (e, 4) of light of given intensity and polarisation, behind the telescope and the films of light
-    from the sky.
-    """
-    exposures, x, y = illumination.exposures, illumination.x, illumination.y
+    """Stokes vectors (e, 4) behind the telescope, of light of given intensity and polarisation."""
     light = jnp.stack([intensity, qu[:, 0], qu[:, 1], jnp.zeros_like(intensity)], axis=-1)
-    if instrument.telescope():
-        light = jnp.where(
-            bypasses_telescope(instrument, illumination)[:, None],
-            light,
-            light @ telescope(instrument, x, y).T,
-        )
+    if not instrument.telescope():
+        return light
+    behind = light @ telescope(instrument, illumination.x, illumination.y).T
+    return jnp.where(bypasses_telescope(instrument, illumination)[:, None], light, behind)
+
+
+def through_sky_films(
+    instrument: LightPath, illumination: PointIllumination, light: Float[Array, "e 4"]
+) -> Float[Array, "e 4"]:
+    """Stokes vectors (e, 4) ahead of the polariser, of light behind the telescope: what changes light from the sky in
+    single exposures stands between the two, in an instrument without effects (`LightPath.sky_films`).
+    """
     for film in instrument.sky_films:
-        light = jnp.where(
-            bypasses_telescope(instrument, illumination)[:, None], light, film.through(light, exposures, x, y)
-        )
+        behind = film.through(light, illumination.exposures, illumination.x, illumination.y)
+        light = jnp.where(bypasses_telescope(instrument, illumination)[:, None], light, behind)
     return light
 
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -327,6 +327,15 @@ class LightSlopes(NamedTuple):
 
 def light_slots(instrument: Instrument) -> dict[Slot, int]:
     """Positions of the slots of the light of an instrument (`patched`); of a single star it is that of all."""
+    polariser, slots = instrument.polariser, _light_numbers(instrument)
+    if polariser is not None:
+        slots += [(kind, "of", polariser.name) for kind in GENERATORS]
+        slots += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
+    return {("light", *slot): i for i, slot in enumerate(slots)}
+
+
+def _light_numbers(instrument: Instrument) -> list[Slot]:
+    """The slots that are numbers of the sources and of the polariser."""
     polariser = instrument.polariser
     slots: list[Slot] = [("rotator", "of", SKY)]
     if any(isinstance(source, MoonSky) for source in instrument.sources):
@@ -334,21 +343,31 @@ def light_slots(instrument: Instrument) -> dict[Slot, int]:
     if instrument.standard.names:
         slots += [(kind, "of", Standards.name) for kind in (*OF_QU, "rotator", "degree")]
     if polariser is not None:
-        slots += [(kind, "of", polariser.name) for kind in (*OF_POLARISER, *GENERATORS)]
-        slots += [(kind, "ahead of", polariser.name) for kind in (*GENERATORS, *ADDED)]
-    return {("light", *slot): i for i, slot in enumerate(slots)}
+        slots += [(kind, "of", polariser.name) for kind in OF_POLARISER]
+    return slots
 
 
 def light_slopes(instrument: Instrument, illumination: PointIllumination) -> LightSlopes:
-    """Slopes of the light at a field point."""
+    """Slopes of the light at a field point.
+
+    Those of generators are closed: a matrix 1 + s G at a place adds G S to the light S there.
+    """
     instrument = instrument.patched()
-    exposures, x, y, slots = illumination.exposures, illumination.x, illumination.y, light_slots(instrument)
-    count = exposures.kind.shape[0]
+    exposures, x, y = illumination.exposures, illumination.x, illumination.y
+    count, numbers = exposures.kind.shape[0], _light_numbers(instrument)
 
     def stokes(sizes: Float[Array, " l"]) -> Float[Array, "e 4"]:
-        return light.stokes(_lit(instrument, dict(zip(slots, sizes, strict=True)), count), illumination)
+        return light.stokes(_lit(instrument, dict(zip(numbers, sizes, strict=True)), count), illumination)
 
-    value, slopes = derivatives(stokes, (jnp.zeros(len(slots)),), (jnp.eye(len(slots)),))
+    value, slopes = derivatives(stokes, (jnp.zeros(len(numbers)),), (jnp.eye(len(numbers)),))
+    if instrument.polariser is not None:
+        inside = exposures.clp_in[:, None]
+        of_polariser = jnp.where(inside, _generated(GENERATORS, value), 0.0)
+        bypassing = light.bypasses_telescope(instrument, illumination)[:, None]
+        made = _generated((*GENERATORS, *ADDED), light.behind_telescope(instrument, illumination))
+        made = jnp.where(bypassing | inside, 0.0, made)
+        ahead = jax.vmap(lambda one: light.through_sky_films(instrument, illumination, one))(made)
+        slopes = jnp.concatenate([slopes, of_polariser, ahead])
     factor, share = jnp.ones((count, len(instrument.cameras))), jnp.zeros((count, len(instrument.cameras)))
     for gain in instrument.cameras.exposures:
         factors = gain.factors(exposures, x, y)
@@ -357,11 +376,16 @@ def light_slopes(instrument: Instrument, illumination: PointIllumination) -> Lig
     return LightSlopes(value, slopes, response, factor)
 
 
+def _generated(kinds: Sequence[str], stokes: Float[Array, "e 4"]) -> Float[Array, "g e 4"]:
+    """G S of the light S for each generator."""
+    return jnp.einsum("gij,ej->gei", np.stack([generator(kind) for kind in kinds]), stokes)
+
+
 def _lit(instrument: Instrument, sizes: dict[Slot, Scalar], count: int) -> Instrument:
     """The instrument with changes of the light; q and u of the sky are those of all exposures, of stars of all."""
     sources: dict[str, list[Scalar]] = {SKY: [], Standards.name: []}
     terms = []
-    for (_, *slot), size in sizes.items():
+    for slot, size in sizes.items():
         if slot[0] in OF_QU:
             sources[slot[-1]].append(size)
         else:
