@@ -9,7 +9,7 @@ import pytest
 from small_run import SMALL
 
 from walop_jax.data.table_intensities import TableIntensities
-from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.design import Design, Measured
 from walop_jax.diagnosis.examination import examine
 from walop_jax.diagnosis.findings import document
 from walop_jax.diagnosis.grammar import hypotheses, smooth_fields
@@ -129,7 +129,7 @@ def made_up(rng, length=1.0):
     residual = rng.standard_normal(rows + priors)
     design = object.__new__(Design)
     vars(design).update(
-        columns=SimpleNamespace(rounded=lambda changes, exact: (None, columns)),
+        measured=Measured.__new__(Measured),
         point=point,
         residual=residual,
         projector=SimpleNamespace(free=rows - 6),
@@ -139,6 +139,7 @@ def made_up(rng, length=1.0):
             model=SimpleNamespace(template=SimpleNamespace(units=SimpleNamespace(field=0.3))),
         ),
     )
+    vars(design.measured)["columns"] = SimpleNamespace(rounded=lambda changes, exact: (None, columns))
     changes = [Change.parsed(text) for text in ("gain of O1 * hours", "turn of polariser", "gain of E2")]
     fields = [SmoothField((changes[0],), False), SmoothField(tuple(changes[1:]), False)]
     smooth = SmoothFields(design, fields, Context(), (basis[:, :4], 0.5 * basis[:, 4:]))
