@@ -129,7 +129,7 @@ def made_up(rng, length=1.0):
     residual = rng.standard_normal(rows + priors)
     design = object.__new__(Design)
     vars(design).update(
-        measured=Measured.__new__(Measured),
+        measured=object.__new__(Measured),
         point=point,
         residual=residual,
         projector=SimpleNamespace(free=rows - 6),
@@ -139,7 +139,8 @@ def made_up(rng, length=1.0):
             model=SimpleNamespace(template=SimpleNamespace(units=SimpleNamespace(field=0.3))),
         ),
     )
-    vars(design.measured)["columns"] = SimpleNamespace(rounded=lambda changes, exact: (None, columns))
+    made = vars(design.measured)["columns"] = object.__new__(Columns)
+    vars(made)["rounded"] = lambda changes, exact: (None, columns)
     changes = [Change.parsed(text) for text in ("gain of O1 * hours", "turn of polariser", "gain of E2")]
     fields = [SmoothField((changes[0],), False), SmoothField(tuple(changes[1:]), False)]
     smooth = SmoothFields(design, fields, Context(), (basis[:, :4], 0.5 * basis[:, 4:]))
