@@ -20,7 +20,7 @@ from walop_jax.diagnosis.smooth_fields import SmoothFields
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit
-from walop_jax.likelihood.columns import own_columns
+from walop_jax.likelihood.columns import Columns, own_columns
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects import Context, Described
