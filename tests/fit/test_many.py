@@ -11,6 +11,7 @@ from changed_sets import block_of, with_block
 from small_run import SEED, SMALL
 
 from walop_jax.data.records import CalibrationSet
+from walop_jax.fit import many
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.many import ManyFits, refit_many
 from walop_jax.fit.refit import fit
@@ -30,16 +31,22 @@ def realisations(count: int) -> tuple[CalibrationSet, ...]:
 
 
 @functools.cache
-def together() -> ManyFits:
-    """Four realisations, and the last of them once more with a camera that lost half of its light in one exposure."""
+def together(approached: int = many.APPROACHED) -> ManyFits:
+    """Four realisations, and the last of them once more with a camera that lost half of its light in one exposure.
+
+    More sets than `approached` begin with steps whose derivatives are held.
+    """
     *sets, last = realisations(4)
     counts = block_of(last).counts.copy()
     counts[:, 2, 0] *= 0.5
-    return refit_many([*sets, last, with_block(last, counts=counts)])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(many, "APPROACHED", approached)
+        return refit_many([*sets, last, with_block(last, counts=counts)])
 
 
-def test_every_fit_is_the_one_of_its_own_set():
-    fits = together()
+@pytest.mark.parametrize("approached", [many.APPROACHED, 1])
+def test_every_fit_is_the_one_of_its_own_set(approached):
+    fits = together(approached)
     for number, calset in enumerate(realisations(4)):
         own = fit(Likelihood.of(calset, base_model(calset)))
         free = own.model.free
@@ -50,8 +57,17 @@ def test_every_fit_is_the_one_of_its_own_set():
         np.testing.assert_allclose(fits[number].sigma[free], own.sigma[free], rtol=1e-4)
 
 
-def test_a_set_that_is_far_from_the_model_is_fitted_alone_and_told():
-    fits = together()
+def test_steps_with_held_derivatives_lead_near_the_minimum():
+    """Two places are looked at instead of four, and the first of them is lower already than the one without."""
+    few, many_sets = together(), together(1)
+    for number in (1, 2, 3):
+        assert many_sets[number].minimum.steps <= few[number].minimum.steps - 1
+        assert many_sets[number].minimum.history[0] < few[number].minimum.history[1]
+
+
+@pytest.mark.parametrize("approached", [many.APPROACHED, 1])
+def test_a_set_that_is_far_from_the_model_is_fitted_alone_and_told(approached):
+    fits = together(approached)
     assert fits.alone == (4,)
     assert "fitted by themselves" in str(fits)
     assert fits[4].chi2 / fits[4].dof > 25.0

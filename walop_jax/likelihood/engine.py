@@ -37,8 +37,18 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
 
+
+class HeldSlopes(NamedTuple):
+    """Derivatives of the band rows in the parameters of `optics.directions`, at the sites of a point, held as they are.
+
+    With them the rows themselves remain exact, while a step costs a tenth: the derivatives of near values serve.
+    """
+
+    slopes: Float[Array, "m o b r 4"]
+
+
 Flux = Float[Array, "e f"]
-Nodes = FieldTable | None
+Nodes = FieldTable | HeldSlopes | None
 NEWTON_STEPS = 3  # each squares the fraction of the detectors' distortion that is missing from the flux
 
 
@@ -95,9 +105,23 @@ def rows_at(
     sites = field_sites(template, point)
     if nodes is None:
         return jax.vmap(optics.band_rows, (None, None, None, 0, 0))(values, template, plan, *sites)
-    rows, slopes = nodes(*sites)
+    if isinstance(nodes, HeldSlopes):
+        there, slopes = with_values(template)(jax.lax.stop_gradient(values)), nodes.slopes
+        rows = jax.vmap(light.band_rows, (None, None, 0, 0))(there, plan, *sites)
+    else:
+        rows, slopes = nodes(*sites)
     index = jnp.asarray(optics.directions(template, plan).index)
     return optics.with_slopes(values, rows, jnp.swapaxes(slopes, 0, 1), index)
+
+
+def held_slopes(instrument: Instrument, plan: Plan, data: PointData) -> HeldSlopes:
+    """The derivatives of the band rows at the sites of all points."""
+
+    def at(point: PointData) -> Float[Array, "m o b r 4"]:
+        sites = field_sites(instrument, point)
+        return jax.vmap(optics.rows_and_slopes, (None, None, 0, 0))(instrument, plan, *sites)[1]
+
+    return HeldSlopes(jax.vmap(at)(data))
 
 
 def throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
@@ -277,9 +301,9 @@ def _on_table(instrument: Instrument, plan: Plan, data: PointData, nodes: FieldT
     """
     points, block = data.x.shape[0], limits.JACOBIAN_BLOCK
     if points <= block or points % block:
-        return _block_equations(instrument, plan, data, nodes)
+        return block_equations(instrument, plan, data, nodes)
     blocks = jax.tree.map(lambda v: v.reshape(-1, block, *v.shape[1:]), data)
-    return summed(lambda part: _block_equations(instrument, plan, part, nodes), blocks)
+    return summed(lambda part: block_equations(instrument, plan, part, nodes), blocks)
 
 
 def summed(function: Callable[[Any], Any], parts: Any) -> Any:
@@ -293,17 +317,24 @@ def summed(function: Callable[[Any], Any], parts: Any) -> Any:
     return jax.lax.scan(add, nothing, parts)[0]
 
 
-def _block_equations(
-    instrument: Instrument, plan: Plan, data: PointData, nodes: FieldTable
+def block_equations(
+    instrument: Instrument, plan: Plan, data: PointData, nodes: Nodes = None
 ) -> NormalEquations:
+    """The normal equations of some points, each in its local quantities first: far fewer products than of all columns.
+
+    `HeldSlopes` are those of all points.
+    """
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
-    def of_point(point: PointData) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
+    def of_point(
+        point: PointData, nodes: Nodes
+    ) -> tuple[Float[Array, ""], Float[Array, " l"], Float[Array, "l l"]]:
         """χ², Jᵀr and JᵀJ in its local quantities."""
         r, jacobian, _ = _point_jacobian(instrument, plan, point, nodes)
         return r @ r, jacobian @ r, jacobian @ jacobian.T
 
-    chi2, gradient, gram = jax.vmap(of_point)(data)
+    each = 0 if isinstance(nodes, HeldSlopes) else None
+    chi2, gradient, gram = jax.vmap(of_point, (0, each))(data, nodes)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     g = jnp.zeros(size).at[plain].set(gradient[:, :k].sum(axis=0))
