@@ -329,11 +329,9 @@ class LinearStep:
 
         None for an addition of another kind. The residuals are the same.
         """
-        changes, polariser = addition.changes, self.laid.template.polariser
-        ahead = None if polariser is None else ("ahead of", polariser.name)
+        changes, template = addition.changes, self.laid.template
         of_standards = all(
-            c.kind in GENERATORS and (c.relation, c.place) == ahead and _STANDARDS in c.factors
-            for c in changes
+            c.kind in GENERATORS and c.is_of_sky(template) and _STANDARDS in c.factors for c in changes
         )
         if not changes or not of_standards:
             return None

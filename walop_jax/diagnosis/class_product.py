@@ -148,12 +148,10 @@ class Questions(NamedTuple):
         """The effect that includes all of `of_errors` that acts on stars, zero; None if nothing does."""
         described = [] if self.shape is None else changes_in(self.shape.members[0].on_stars)
         changes = [c for one in self.of_errors for member in one.members for c in changes_in(member.on_stars)]
-        polariser = model.template.polariser
         # Ahead of the polariser no element may depend on exposures; its light may.
-        ahead = None if polariser is None else ("ahead of", polariser.name)
         optical = (change for change in described if change.kind in GENERATORS)
         places = dict.fromkeys(
-            _place(c) for c in optical if not c.beside_field or (c.relation, c.place) != ahead
+            _place(c) for c in optical if not c.beside_field or not c.is_of_sky(model.template)
         )
         others = [c.text for c in changes if c.kind not in GENERATORS or _place(c) not in places]
         return Deviations.of(context, places=places, sentences=others) if changes else None

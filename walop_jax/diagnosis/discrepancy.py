@@ -282,7 +282,7 @@ def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
     """Places of the train, that ahead of it first, whether or not exposures show it."""
     bare = dataclasses.replace(laid.template, effects=())
     places = list(itertools.chain(*places_of(bare, laid.fit.calset.exposures)))
-    front = places[:1] if bare.polariser is None else [("ahead of", bare.polariser.name)]
+    front = places[:1] if bare.ahead_of_polariser is None else [bare.ahead_of_polariser]
     return [*front, *(place for place in places if place not in front)]
 
 

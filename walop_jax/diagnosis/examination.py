@@ -27,7 +27,6 @@ from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, ScoreTable, 
 from walop_jax.diagnosis.smooth_fields import SmoothFields
 from walop_jax.diagnosis.synonyms import synonyms
 from walop_jax.fit.refit import FitResult
-from walop_jax.fit.verdict import SUSPECT_SIGMA
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Described, EffectKind
@@ -255,11 +254,6 @@ def smallest(pairs: Iterable[tuple[str, float]]) -> dict[str, float]:
     for name, value in pairs:
         least[name] = min(value, least.get(name, np.inf))
     return least
-
-
-def explains(chi2: float, dof: float) -> bool:
-    """True if χ² agrees with noise alone, by the criterion of `FitResult.explains_data`."""
-    return bool(dof > 0 and chi2 - dof < SUSPECT_SIGMA * np.sqrt(2.0 * dof))
 
 
 def upper_limit(value: float, sigma: float, *, one_sided: bool) -> float:

@@ -216,16 +216,16 @@ def _with_laws(
 
 def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool) -> Iterator[Subject]:
     """All changes that fit the instrument and are visible in the exposures."""
-    polariser, sky = instrument.polariser, ~exposures.clp_in
+    ahead, sky = instrument.ahead_of_polariser, ~exposures.clp_in
     groups = [group for group in GROUPS if over_field or not group[0].endswith(("radial", "diagonal"))]
     for places in places_of(instrument, exposures):
-        inside = sky if polariser is not None and places == [("ahead of", polariser.name)] else None
+        inside = sky if places == [ahead] else None
         anything = [_base(GENERATORS, *place) for place in places]
         for number, group in enumerate(groups):
             bases = (_base(group, *place) for place in places)
             yield Subject.of(*bases, inside=inside, anything=[] if number else anything)
-    if polariser is not None and sky.any():
-        yield Subject.of(_base(ADDED, "ahead of", polariser.name), inside=sky)
+    if ahead is not None and sky.any():
+        yield Subject.of(_base(ADDED, *ahead), inside=sky)
     moving = {element.moves: element for element in instrument.train() if element.moves}
     turning = [prefix for prefix in moving if exposures.position(prefix).inside.any()]
     for prefix in turning:
@@ -253,8 +253,8 @@ def places_of(instrument: Instrument, exposures: Exposures) -> Iterator[list[tup
     train, polariser, arms = list(instrument.train()), instrument.polariser, instrument.arms
     behind = train[len(instrument.telescope()) + (polariser is not None) :]
     if polariser is not None:
-        if not exposures.clp_in.all():
-            yield [("ahead of", polariser.name)]
+        if (ahead := instrument.ahead_of_polariser) and not exposures.clp_in.all():
+            yield [ahead]
         yield [("behind", polariser.name)]
     elif behind:
         yield [("ahead of", behind[0].name)]

@@ -26,10 +26,11 @@ import numpy as np
 
 from walop_jax.diagnosis import thresholds
 from walop_jax.diagnosis.exact import Trial, beyond_prior
-from walop_jax.diagnosis.examination import Evidence, explains
+from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.findings import Choice, descriptions_of
 from walop_jax.diagnosis.hypotheses import Ranked
 from walop_jax.diagnosis.selection import MissingThings, Thing, most_probable
+from walop_jax.fit.verdict import explains
 from walop_jax.model.effects import Described
 
 MOST_LISTED = 40

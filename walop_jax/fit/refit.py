@@ -27,6 +27,8 @@ from walop_jax.fit.verdict import (
     Quality,
     Structure,
     Verdict,
+    excess,
+    explains,
 )
 from walop_jax.io.display import Display
 from walop_jax.io.progress import Stage, Tell
@@ -132,8 +134,8 @@ class FitResult(Fitted):
 
     @property
     def excess(self) -> float:
-        """(χ² − dof) / √(2 dof): how many standard deviations χ² lies above its expectation."""
-        return (self.chi2 - self.dof) / np.sqrt(2.0 * max(self.dof, 1))
+        """How many standard deviations χ² lies above its expectation (`verdict.excess`)."""
+        return excess(self.chi2, self.dof)
 
     @property
     def converged(self) -> bool:
@@ -148,7 +150,7 @@ class FitResult(Fitted):
     @property
     def explains_data(self) -> bool:
         """True if χ² is what noise alone would give."""
-        return self.dof > 0 and bool(self.excess < SUSPECT_SIGMA)
+        return explains(self.chi2, self.dof)
 
     @property
     def nearly_explains_data(self) -> bool:

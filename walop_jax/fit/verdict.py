@@ -26,6 +26,16 @@ SUSPECT_SIGMA = 5.0
 """Excess of χ² over its expectation, in its own standard deviations, from which a model does not explain the data."""
 
 
+def excess(chi2: float, dof: float) -> float:
+    """(χ² − dof) / √(2 dof): how many standard deviations χ² lies above its expectation."""
+    return float((chi2 - dof) / np.sqrt(2.0 * max(dof, 1)))
+
+
+def explains(chi2: float, dof: float) -> bool:
+    """True if χ² is what noise alone would give."""
+    return bool(dof > 0 and excess(chi2, dof) < SUSPECT_SIGMA)
+
+
 class Quality(enum.IntFlag):
     """Bits of QUALITY (of a product) and FLAG (of a row, star or pixel), each with its meaning."""
 

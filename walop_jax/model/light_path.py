@@ -107,6 +107,14 @@ class LightPath(Component):
                 )
         return elements
 
+    @property
+    def ahead_of_polariser(self) -> tuple[str, str] | None:
+        """The place directly ahead of the polariser, as changes name it, which light from the sky alone passes.
+
+        None without a polariser.
+        """
+        return None if self.polariser is None else ("ahead of", self.polariser.name)
+
     def behind_polariser(self) -> tuple[Element, ...]:
         """The elements behind the polariser; all elements without a polariser."""
         return tuple(self.train())[len(self.telescope()) + (self.polariser is not None) :]

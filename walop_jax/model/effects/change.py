@@ -216,6 +216,10 @@ class Change:
         """True if it acts on the counts of cameras, behind all optics."""
         return self.kind in OF_CAMERAS
 
+    def is_of_sky(self, instrument: Instrument) -> bool:
+        """True for a change of light from the sky alone, ahead of the polariser."""
+        return (self.relation, self.place) == instrument.ahead_of_polariser
+
     @property
     def over_field(self) -> tuple[str, ...]:
         """Texts of its factors that are patterns over the field."""

@@ -233,7 +233,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     kind, polariser = change.kind, instrument.polariser
     over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
     always = Combinations(over, ("steady", *SLOW))
-    if _is_ahead(instrument, change):
+    if change.is_of_sky(instrument):
         single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
         return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
     if change.relation != "of":
@@ -254,12 +254,6 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     return Grows((FIELD, WAVELENGTH, EXPOSURE), moves, tried)
 
 
-def _is_ahead(instrument: Instrument, change: Change) -> bool:
-    """True for a change of light from the sky alone, ahead of the polariser."""
-    polariser = instrument.polariser
-    return polariser is not None and change.relation == "ahead of" and change.place == polariser.name
-
-
 def _films_of_sky(instrument: Instrument, terms: Sequence[Term]) -> tuple[Instrument, list[Term]]:
     """The instrument with the terms ahead of the polariser that vary from exposure to exposure, and all other terms.
 
@@ -268,7 +262,7 @@ def _films_of_sky(instrument: Instrument, terms: Sequence[Term]) -> tuple[Instru
     of_film, others = list[Term](), list[Term]()
     for term in terms:
         varies = any(item.depends_on == EXPOSURE for item in term[0].grows_with)
-        (of_film if varies and _is_ahead(instrument, term[0]) else others).append(term)
+        (of_film if varies and term[0].is_of_sky(instrument) else others).append(term)
     if of_film:
         instrument = instrument.changed("", sky_films=lambda films: (*films, Film(**_columns(of_film))))
     return instrument, others
@@ -318,7 +312,7 @@ def _grows_added(instrument: Instrument, change: Change) -> Grows:
         Combinations(along=(*SINGLE, "kind")),
         Combinations(("smooth",), ("kind",)),  # the sky beside the Moon differs from point to point
     )
-    return Grows((FIELD, EXPOSURE), None, tried) if _is_ahead(instrument, change) else Grows()
+    return Grows((FIELD, EXPOSURE), None, tried) if change.is_of_sky(instrument) else Grows()
 
 
 def _displaced(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
