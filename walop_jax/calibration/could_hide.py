@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from walop_jax.calibration.accuracy import LARGEST_P, change_of_qu
+from walop_jax.calibration.accuracy import LARGEST_P, Matrices, change_of_qu
 from walop_jax.calibration.matrix import Filters, matrix_slopes, planned_matrices
 from walop_jax.data.settings import Settings
 from walop_jax.io.shapes import OfPoints
@@ -124,7 +124,7 @@ def hidden_errors(
             effect = acting[number]
             turn = turn_of(instrument, effect)
             if acts_in(effect, instrument, settings):
-                change = change + change_by_effect(instrument, effect, settings, filters, x, y)
+                change = change + change_by_effect(instrument, effect, settings, filters, x, y, matrix)
         errors[number] = change_of_qu(matrix, matrix + change) + 2.0 * LARGEST_P * abs(turn)
     return errors
 
@@ -237,9 +237,20 @@ def turn_of(instrument: Instrument, effect: Effect) -> float:
 
 
 def change_by_effect(
-    instrument: Instrument, effect: Effect, setting: Settings, filters: Filters, x: OfPoints, y: OfPoints
-) -> Float[np.ndarray, "p a 3"]:
-    """The instrument matrix (point, arm, 3) with an effect at its size, less the matrix without it, in one setting."""
-    models = with_effect(instrument, effect), instrument
-    after, before = (planned_matrices(m, plan_for_settings(m, setting, filters), x, y) for m in models)
-    return after - before
+    instrument: Instrument,
+    effect: Effect,
+    setting: Settings,
+    filters: Filters,
+    x: OfPoints,
+    y: OfPoints,
+    before: Matrices | None = None,
+) -> Matrices:
+    """The instrument matrix (point, arm, 3) with an effect at its size, less the matrix without it, in one setting.
+
+    `before` is the matrix without it, where that is known.
+    """
+
+    def of(model: Instrument) -> Matrices:
+        return planned_matrices(model, plan_for_settings(model, setting, filters), x, y)
+
+    return of(with_effect(instrument, effect)) - (of(instrument) if before is None else before)
