@@ -115,6 +115,8 @@ class Measured:
         unit = self.model / np.where(self.weight > 0, self.weight, 1.0)
         count = np.maximum(self.used.sum(axis=1), 1)[:, None]
         self.level: Float[np.ndarray, "p k"] = np.where(self.used[..., None], unit, 0.0).sum(axis=1) / count
+        # Derivatives of the residuals with respect to numbers that the set states, as far as they were asked.
+        self.by_stated_number: dict[str, Float[np.ndarray, " _"]] = {}
 
     def counts_changed_by(self, sort: Sort) -> ResidualCube:
         """Counts, in standard errors, that a pattern of 1 everywhere adds to every camera as a gain, or as light."""

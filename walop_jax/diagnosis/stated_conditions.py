@@ -36,7 +36,7 @@ from scipy import special
 from walop_jax.data.records import ERROR_WORDS, CalibrationSet
 from walop_jax.data.table_intensities import TableIntensities
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import Design
+from walop_jax.diagnosis.design import Design, Measured
 from walop_jax.diagnosis.hypotheses import Probe, all_candidates, applicable, probes
 from walop_jax.diagnosis.readings import with_places, with_values
 from walop_jax.diagnosis.score import Candidate, Score, ScoreSpace, corrected_p
@@ -375,14 +375,22 @@ def _columns(design: Design, statements: Sequence[Stated]) -> Iterator[Float[np.
             yield in_x[design.point] * by_x + in_y[design.point] * by_y
 
 
-def _column(design: Design, statement: Stated) -> np.ndarray:
+def _column(design: Design, statement: Stated) -> Float[np.ndarray, " _"]:
+    """Derivative of the residuals with respect to a stated number, at the fit whose columns are used."""
+    origin = design.origin
+    if statement.what not in origin.by_stated_number:
+        origin.by_stated_number[statement.what] = _difference(origin, statement)
+    return origin.by_stated_number[statement.what]
+
+
+def _difference(measured: Measured, statement: Stated) -> Float[np.ndarray, " _"]:
     def residual(step: float) -> np.ndarray:
-        likelihood = Likelihood.of(statement.changed(step), design.fit.model)
-        return likelihood.residuals(design.fit.values)[1][design.measured.used].reshape(-1)
+        likelihood = Likelihood.of(statement.changed(step), measured.likelihood.model)
+        return likelihood.residuals(measured.values)[1][measured.used].reshape(-1)
 
     step = STEP * statement.width
     if statement.along is None:  # smooth: what a one-sided difference leaves out is as small as the step
-        return (residual(step) - design.measured.residual[design.measured.used].reshape(-1)) / step
+        return (residual(step) - measured.residual[measured.used].reshape(-1)) / step
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
