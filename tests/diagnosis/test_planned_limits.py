@@ -94,16 +94,19 @@ def test_rounding_is_no_error_of_stars():
     assert change_of_qu(matrix, moved)[0] == pytest.approx(np.hypot(*(inverse @ [1e-9, 1e-9])), rel=1e-6)
 
 
-@pytest.mark.parametrize("instrument", ["WALOP-SOUTH", "WALOP-NORTH"])
-def test_limits_of_a_plan_hold_for_sets_that_are_taken_so(instrument):
+@pytest.mark.parametrize(
+    ("instrument", "further"), [("WALOP-SOUTH", ("clp_extinction",)), ("WALOP-NORTH", ())]
+)
+def test_limits_of_a_plan_hold_for_sets_that_are_taken_so(instrument, further):
     """Of another instrument than those of the forecast, in other weather, with noise; to a factor of 1.3.
 
-    By the design in steady weather leakage was detected at 8 times its limit in the set, a pedestal at 20 times.
+    By the design in steady weather leakage was detected at 8 times its limit in the set, a pedestal at 20 times. Data
+    of WALOP-NORTH hold 0.025 σ of an extinction of the usual size: whether that is asked depends on the instrument.
     """
     plan = ObservingPlan(
         instrument, grid=5, standard_grid=2, polariser_angles=9, full_turn=True, moon_patches=3, standards=3
     )
-    names = ("camera_leakage", "pedestal", "ghost", "standard_angles", "clp_extinction", "clp_wobble")
+    names = ("camera_leakage", "pedestal", "ghost", "standard_angles", "clp_wobble", *further)
     catalogue = tuple(map(effect_by_name, names))
     forecast = limits(plan, effects=catalogue)
     assert forecast.instruments == INSTRUMENTS

@@ -384,14 +384,17 @@ def _column(design: Design, statement: Stated) -> Float[np.ndarray, " _"]:
 
 
 def _difference(measured: Measured, statement: Stated) -> Float[np.ndarray, " _"]:
-    def residual(step: float) -> np.ndarray:
-        likelihood = Likelihood.of(statement.changed(step), measured.likelihood.model)
+    def residual(likelihood: Likelihood) -> np.ndarray:
         return likelihood.residuals(measured.values)[1][measured.used].reshape(-1)
+
+    def moved(step: float) -> np.ndarray:
+        return residual(Likelihood.of(statement.changed(step), measured.likelihood.model))
 
     step = STEP * statement.width
     if statement.along is None:  # smooth: what a one-sided difference leaves out is as small as the step
-        return (residual(step) - measured.residual[measured.used].reshape(-1)) / step
-    return (residual(step) - residual(-step)) / (2.0 * step)
+        # Of one program: the rounding of another one, over a small step, would be a column of noise.
+        return (moved(step) - residual(measured.likelihood)) / step
+    return (moved(step) - moved(-step)) / (2.0 * step)
 
 
 def stated_numbers(calset: CalibrationSet) -> Iterator[Stated]:
