@@ -284,19 +284,25 @@ def _with_ties(model: Model, new: Sequence[int], amplitudes: Float[np.ndarray, "
     What is the same multiple of the amplitudes as an earlier description is tied to it; any other combination of
     earlier ones is held: its value and errors follow from theirs.
     """
-    parameters, free = list(model.parameters), list[int]()
+    parameters, alike = list(model.parameters), dict[bytes, list[int]]()
+    # An orthonormal basis of the combinations that are free: of thousands, each is held against all before it.
+    basis, rank = np.zeros((min(len(new), amplitudes.shape[1]), amplitudes.shape[1])), 0
     for i in new:
-        row, earlier = amplitudes[i], amplitudes[free]
+        row, group = amplitudes[i], alike.setdefault((amplitudes[i] != 0.0).tobytes(), [])
         same = next(
-            (k for k in free if np.allclose(amplitudes[k], row, rtol=thresholds.ROUNDING, atol=0.0)), None
+            (k for k in group if np.allclose(amplitudes[k], row, rtol=thresholds.ROUNDING, atol=0.0)), None
         )
-        remainder = row - np.linalg.lstsq(earlier.T, row, rcond=None)[0] @ earlier if free else row
         if same is not None:
             parameters[i] = dataclasses.replace(parameters[i], tie=parameters[same].name)
-        elif np.abs(remainder).max() <= thresholds.ROUNDING * np.abs(row).max():
+            continue
+        remainder = row
+        for _ in range(2):  # what rounding leaves the second time is nothing (Giraud et al. 2005)
+            remainder = remainder - (basis[:rank] @ remainder) @ basis[:rank]
+        if np.abs(remainder).max() <= thresholds.ROUNDING * np.abs(row).max():
             parameters[i] = dataclasses.replace(parameters[i], free=False)
         else:
-            free.append(i)
+            group.append(i)
+            basis[rank], rank = remainder / np.linalg.norm(remainder), rank + 1
     return dataclasses.replace(model, parameters=tuple(parameters))
 
 
