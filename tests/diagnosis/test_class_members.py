@@ -13,7 +13,7 @@ from small_run import SMALL
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.certify import certify
 from walop_jax.calibration.matrix import instrument_matrices
-from walop_jax.diagnosis import grammar
+from walop_jax.diagnosis import class_members, grammar
 from walop_jax.diagnosis.class_members import LinearisedFit, LinearStep, classes_of
 from walop_jax.diagnosis.class_product import (
     Answer,
@@ -134,6 +134,12 @@ def test_probabilities_of_members_add_up_to_one(told, monkeypatch):
     (group,) = classes_of(laid, {TOLD: ()})
     assert len(group.members) == 4
     assert sum(member.probability for member in group.members) == pytest.approx(1.0, abs=1e-12)
+    # A product holds so many changes at most, those of the most probable members, which then are all there is.
+    with monkeypatch.context() as less:
+        less.setattr(class_members, "MOST_CHANGES", 2)
+        (fewer,) = classes_of(laid, {TOLD: ()})
+    assert [m.evidence for m in fewer.members] == [m.evidence for m in group.members[:3]]
+    assert sum(member.probability for member in fewer.members) == pytest.approx(1.0, abs=1e-12)
     # What no member changes, the mean does not change: half-wave plates of thousands of µm, for example.
     alone = Calibration.from_fit(result.with_verdict())
     product = averaged(alone, Questions(additions=(group,)))

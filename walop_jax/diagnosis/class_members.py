@@ -50,6 +50,9 @@ from walop_jax.model.effects.optics import GENERATORS
 _STANDARDS = "kind standard"
 """The factor of a change in exposures of standards alone."""
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
+MOST_CHANGES = 400
+"""Changes in the members of a class beside the addition: a product of thousands of them takes minutes for every star.
+Six members that are smooth fields of all kinds of optics would have 1400."""
 
 
 def classes_of(
@@ -173,6 +176,8 @@ class LinearisedFit:
                 both.append(twin._replace(evidence=members[group[0]].evidence + twin.evidence))
         chosen = [both[group[0]] for group in self.distinct(both)][:MOST_MEMBERS]
         chosen = [member for member in chosen if member.evidence > best - thresholds.IMPROBABLE]
+        changes = itertools.accumulate((len(changes_in(member.sums)) for member in chosen[1:]), initial=0)
+        chosen = [member for member, so_far in zip(chosen, changes, strict=True) if so_far <= MOST_CHANGES]
         weights = special.softmax([member.evidence for member in chosen])
         chosen = [
             member._replace(probability=float(weight)) for member, weight in zip(chosen, weights, strict=True)
