@@ -178,7 +178,7 @@ def _slopes_at(
 
 _vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
 _slopes = compiled(_slopes_at, kept_as="slopes")  # of hundreds of places after every fit
-_slopes_once = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes")
+_slopes_once = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes_once")
 
 
 def analysis_vectors(
