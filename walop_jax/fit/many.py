@@ -10,8 +10,8 @@ Layout      sets are of one layout if their plans have the same structure: as ma
             in the program once.
 Start       the first set begins at the start values of the model, as `refit.fit` does; all others begin at its minimum,
             from which they are a few steps away. Of many sets each takes `APPROACH` steps with the derivatives of the
-            optics there: these cost a tenth of a step with derivatives of their own, and end at a few per cent of a
-            standard error from the minimum (in a set of 45 points, whose errors let the optics vary by 10⁻²).
+            optics there: these cost a third of a step with derivatives of its own, and end at a few per cent of a
+            standard error from the minimum (measured on sets of 45 points × 16 exposures).
 Left over   a search that does not end, or ends far from the data (χ²/dof above `search.FAR_OFF`), is made anew by
             `refit.fit`, which scales errors and tries plates one order of retardance away; so is one of a model with
             air gaps, whose fringe orders are tried there, one whose plates need more wavelength nodes than were laid
@@ -63,7 +63,7 @@ TOGETHER = 32
 APPROACH = 2
 """Steps with held derivatives: a third one would come no nearer to the minimum with derivatives of its own."""
 APPROACHED = 100
-"""Sets from which on their starts are worth two programs more: each saves 40 ms, and the programs cost four seconds."""
+"""Sets from which on their starts are worth two programs more: each saves some 20 ms, the programs cost seconds."""
 
 FACTS = ("exposures", "points", "sources", "filters", "site")
 """What the plan of a set depends on, beside the model."""
