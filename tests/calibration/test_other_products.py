@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 from calibration_in_words import changed, in_words
 from handmade_run import parameters
-from test_product import assert_equal, rewrite
+from test_product import NOT_WRITTEN, assert_equal, rewrite
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps, ResidualMap, matrix_names, residual_names
@@ -157,13 +157,13 @@ def test_blanks_in_a_name_stay(calset, tmp_path):
         (lambda h: setattr(h["RESIDUAL"], "data", h["RESIDUAL"].data[:7]), r"\[RESIDUAL\]"),
         (lambda h: h["M21"].header.remove("ANGLE1"), r"\[M21\] ELEM1: is 'HWP' at None"),
         (lambda h: h["M21"].header.set("ELEM1", "hwp 2"), r"\[M21\] ELEM1: is 'hwp 2'"),
-        (lambda h: h["M21"].header.set("ANGLE1", 30.0), "not what was written"),
-        (lambda h: h["EXPOSURES"].data["HWP_ANGLE"].__setitem__(1, 20.0), "not what was written"),
+        (lambda h: h["M21"].header.set("ANGLE1", 30.0), NOT_WRITTEN),
+        (lambda h: h["EXPOSURES"].data["HWP_ANGLE"].__setitem__(1, 20.0), NOT_WRITTEN),
         (
             lambda h: h["EXPOSURES"].data["HWP_ANGLE"].__setitem__(1, NAN),
             r"HWP_ANGLE: is not finite in row 1",
         ),
-        (lambda h: h[0].header.set("PRODVERS", 1), "not what was written"),
+        (lambda h: h[0].header.set("PRODVERS", 1), NOT_WRITTEN),
         (lambda h: h.__delitem__("RESIDUAL_ERR"), "RESIDUAL_ERR.*missing"),
         (lambda h: h.__delitem__("RESIDUAL_CHI2"), "RESIDUAL_CHI2.*missing"),
     ],
@@ -171,7 +171,7 @@ def test_blanks_in_a_name_stay(calset, tmp_path):
 def test_what_is_not_as_written_is_refused(calset, tmp_path, change, message):
     path = tmp_path / "p.fits"
     write_calibration(path, product_of(calset, 3, {"HWP": 22.5}))
-    rewrite(path, change)
+    rewrite(path, change, message)
     with pytest.raises(DataError, match=message) as caught:
         read_calibration(path, any_model=True)
     assert str(path) in str(caught.value)

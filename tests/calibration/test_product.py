@@ -16,7 +16,7 @@ from same_record import assert_same
 import walop_jax.calibration.product
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.calibration.matrix import MatrixMaps
-from walop_jax.calibration.product import read_calibration, write_calibration
+from walop_jax.calibration.product import content_of, read_calibration, write_calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.data.grid import Grid
 from walop_jax.fit.model_file import model_without_data, render
@@ -150,11 +150,16 @@ def test_signs_are_spelt_out():
     assert in_ascii("Gál") == "G\\xe1l"
 
 
-def rewrite(path, change):
-    """Change a product with astropy, checksums and all."""
+NOT_WRITTEN = "not what was written"
+
+
+def rewrite(path, change, message):
+    """Change a product with astropy, checksums and all; with its hash as well, unless that is what tells."""
     with fits.open(path) as hdus:
         loaded = fits.HDUList([hdu.copy() for hdu in hdus])
     change(loaded)
+    if message != NOT_WRITTEN:
+        loaded[0].header["CONTHASH"] = content_of(loaded)
     loaded.writeto(path, checksum=True, overwrite=True)
 
 
@@ -165,11 +170,11 @@ def rewrite(path, change):
         (lambda h: h[0].header.set("PRODVERS", "one"), "not a version"),
         (lambda h: h[0].header.remove("PRODVERS"), "is missing"),
         (lambda h: h[0].header.set("INSTRUME", "WALOP-SUOTH"), "WALOP-SOUTH"),
-        (lambda h: h[0].header.set("TRUSTED", True), "not what was written"),
+        (lambda h: h[0].header.set("TRUSTED", True), NOT_WRITTEN),
         (lambda h: h[0].header.set("TRUSTED", 1), "not T or F"),
-        (lambda h: h[0].header.set("CHI2", 5.0), "not what was written"),
+        (lambda h: h[0].header.set("CHI2", 5.0), NOT_WRITTEN),
         (lambda h: h[0].header.remove("DOF"), "DOF"),
-        (lambda h: h["PARAMETERS"].data["VALUE"].__setitem__(1, 0.4), "not what was written"),
+        (lambda h: h["PARAMETERS"].data["VALUE"].__setitem__(1, 0.4), NOT_WRITTEN),
         (lambda h: h["PARAMETERS"].data["SIGMA"].__setitem__(1, 0.4), "does not agree with SIGMA"),
         (lambda h: h["PARAMETERS"].data["NAME"].__setitem__(1, "pupil.magnification"), "there twice"),
         (lambda h: h["COVARIANCE"].data.__setitem__((0, 1), 1.0), "not a covariance"),
@@ -182,7 +187,7 @@ def rewrite(path, change):
     ],
 )
 def test_what_is_not_as_written_is_refused(path, change, message):
-    rewrite(path, change)
+    rewrite(path, change, message)
     with pytest.raises(DataError, match=message) as caught:
         read_calibration(path, any_model=True)
     assert str(path) in str(caught.value)

@@ -135,8 +135,9 @@ def test_what_moon_and_standards_measure_is_measured():
 
 
 def found_with_99_per_cent(tried: int) -> float:
-    """Noncentrality of χ² of one degree of freedom that undercuts a p of 0.0027 of so many in 99 of 100 cases."""
-    threshold = stats.chi2.isf(1.0 - (1.0 - 0.0027) ** (1.0 / tried), 1)
+    """Noncentrality of χ² of one degree of freedom that undercuts the p of 3 σ, of so many, in 99 of 100 cases."""
+    alarm = 2.0 * stats.norm.sf(3.0)
+    threshold = stats.chi2.isf(1.0 - (1.0 - alarm) ** (1.0 / tried), 1)
     return float(optimize.brentq(lambda square: stats.ncx2.sf(threshold, 1, square) - 0.99, 1.0, 200.0))
 
 
@@ -162,7 +163,7 @@ FINE = {"position": 15.0, "scale": 0.01, "scattered": 1e-3, "teff": 0.5}
 def test_what_hides_is_what_the_data_do_not_show_and_is_plausible(errors):
     """h = min(w, √λ s): w the error that the set states, s the error with which its data measure the number."""
     design, singles = singles_of(**errors)
-    mistakes = {one.name: one for one in undetected_errors(design, singles).mistakes}
+    mistakes = {one.name: one for one in undetected_errors(design, singles).errors}
     found, least = list[str](), np.sqrt(found_with_99_per_cent(len(singles.testable)))
     for item in singles.items:
         name = item.single.candidate.name
