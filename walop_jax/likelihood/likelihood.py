@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -520,24 +520,28 @@ class Likelihood(ShortDir):
         self, values: Vector
     ) -> tuple[Float[np.ndarray, "p e"], Float[np.ndarray, "p e k"], Float[np.ndarray, "d f"]]:
         """Best fluxes and residuals, as `residuals` gives them, and the derivatives of `jacobian`."""
-        if self.fits_errors:
-            return self.with_errors_at(values).linearised(values)
-        instrument, select = self.model.instrument(values), self.model.selection()
-        found, jacobian = [], []
-        for batch in self.points:
-            linear = engine.linearised_residuals(instrument, self.plan, batch)
-            jacobian.append(used_rows(linear.slope, batch) @ select)
-            found.append((np.asarray(linear.flux), np.asarray(linear.residual).reshape(batch.weight.shape)))
         if self.layout.interpolated:  # the optics of residuals come from nodes
-            return *self.residuals(values), np.concatenate(jacobian)
-        return *self._of_points(found), np.concatenate(jacobian)
+            return *self.residuals(values), self.jacobian(values)
+        select, found, rows = self.model.selection(), [], []
+        for batch, linear in self._linearised_batches(values):
+            rows.append(used_rows(linear.slope, batch) @ select)
+            found.append((np.asarray(linear.flux), np.asarray(linear.residual).reshape(batch.weight.shape)))
+        return *self._of_points(found), np.concatenate(rows)
 
     def jacobian(self, values: Vector) -> Float[np.ndarray, "d f"]:
         """Derivatives of the used residuals with respect to the free parameters, dense.
 
         Rows run over points, then exposures, then cameras, as in `residuals(values)[1][self.used]`.
         """
-        return self.linearised(values)[2]
+        batches, select = self._linearised_batches(values), self.model.selection()
+        return np.concatenate([used_rows(linear.slope, batch) @ select for batch, linear in batches])
+
+    def _linearised_batches(self, values: Vector) -> Iterator[tuple[engine.PointData, engine.Linearised]]:
+        """Every batch of points, with its residuals and their derivatives in all parameters."""
+        of = self.with_errors_at(values) if self.fits_errors else self
+        instrument = self.model.instrument(values)
+        for batch in of.points:
+            yield batch, engine.linearised_residuals(instrument, self.plan, batch)
 
     def stokes(self, values: Vector) -> Float[np.ndarray, "p e 4"]:
         """Stokes vectors (p, e, 4) of the light that enters the instrument, per unit of flux."""
