@@ -51,8 +51,8 @@ _STANDARDS = "kind standard"
 """The factor of a change in exposures of standards alone."""
 MOST_ASKED, MOST_MEMBERS = 64, 12  # of a class: candidates, and members with different effects on stars
 MOST_CHANGES = 400
-"""Changes in the members of a class beside the addition: a product of thousands of them takes minutes for every star.
-Six members that are smooth fields of all kinds of optics would have 1400."""
+"""Changes in the members of a class beside the addition, so that the optics of its product can be compiled. Six members
+that are smooth fields of all kinds of optics would have 1400."""
 
 
 def classes_of(
