@@ -143,6 +143,7 @@ OF_THE_SOURCE = {  # and of the polariser: no part of what is said of the instru
     "moon_patch": {"q": 0.01, "u": 0.01},
     "rotator_zero": {"angle": 2.0},
     "standard_outlier": {"source": "q", "q": 0.02},
+    "standard_values": {"q": [0.02, -0.01], "u": [0.01, 0.03]},
     "standard_colour": {"source": "q", "q": 0.02},
     "standard_drift": {"source": "q", "q": 0.02},
     "standard_angles": {"angle": 1.0},
@@ -240,10 +241,10 @@ def test_what_is_left_behind_is_named(name):
 
 
 def free(block: str, size: float = 0.01) -> FreeForm:
-    """One block of the free-form term at that size throughout, of alternating sign."""
+    """One block of the free-form term at that size throughout, of a sign that alternates from camera to camera too."""
     empty = FreeForm.of(CONTEXT, blocks=(block,))
     shape = getattr(empty, block).shape
-    values = size * (-1.0) ** np.arange(np.prod(shape)).reshape(shape)
+    values = size * (-1.0) ** np.indices(shape).sum(axis=0)
     return dataclasses.replace(empty, **{block: jnp.asarray(values)})
 
 

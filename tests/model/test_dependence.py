@@ -144,8 +144,8 @@ def check_jacobian(*effects: Effect) -> tuple[list[str], np.ndarray]:
 # Effects are looked at in company: what one of them asks for must not hide what another one needs.
 GROUPS = {
     "sky and polariser": (
-        "moon_multiple_scattering", "moon_patch", "rotator_zero", "standard_outlier", "standard_colour",
-        "standard_drift", "standard_angles", "standard_degrees", "telescope_polarisation", "clp_zero", "clp_wobble",
+        "moon_multiple_scattering", "moon_patch", "rotator_zero", "standard_outlier", "standard_values",
+        "standard_colour", "standard_drift", "standard_angles", "standard_degrees", "telescope_polarisation", "clp_zero", "clp_wobble",
         "clp_extinction", "clp_ellipticity",
     ),
     "lenses and calibration plate": (

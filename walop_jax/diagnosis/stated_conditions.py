@@ -46,7 +46,8 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.laws import YEAR
 
-_ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier")  # camera by camera, and as priors
+# Camera by camera, and as priors.
+_ASKED_OTHERWISE = (*thresholds.ASKED_BY_CAMERA, "standard_outlier", "standard_values")
 _LEVELS = "exposures at a second light level"
 _DARK = "bias and dark frames"
 _ONE_STAR = "a bright star in one beam: its light in the other cameras"

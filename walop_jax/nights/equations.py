@@ -40,7 +40,7 @@ from walop_jax.nights.together import EffectAmplitude, Night, source_of
 from walop_jax.sky.moon import local_sidereal_time
 from walop_jax.sky.nights import night_of
 
-OF_ONE_SET = ("moon_patch", "standard_outlier")
+OF_ONE_SET = ("moon_patch", "standard_outlier", "standard_values")
 """Effects that belong to single exposures, or are parameters of the base model already: no candidates."""
 MOST_SHAPES = 4  # of an effect whose shapes are all candidates: cameras, plates, not places, thicknesses
 OWN = 3.0  # squared distance of a night from its own minimum, for each parameter, that two nights' noise may make

@@ -46,6 +46,7 @@ CONTRACT = {
     "moon_patch": {"q": "", "u": ""},
     "rotator_zero": {"angle": "deg"},
     "standard_outlier": {"source": None, "q": "", "u": ""},
+    "standard_values": {"q": "", "u": ""},
     "standard_colour": {"source": None, "q": "", "u": ""},
     "standard_drift": {"source": None, "q": "1/h", "u": "1/h"},
     "standard_angles": {"angle": "deg"},

@@ -123,14 +123,10 @@ def test_moon_multiple_scattering_at_the_moon_itself():
 
 
 def test_moon_patch_is_of_its_exposure():
-    found = (
-        stokes(
-            dataclasses.replace(
-                make("moon_patch").replaced(q=jnp.array([0.003]), u=jnp.array([-0.004])), moon=((1, 7),)
-            )
-        )
-        - stokes()
-    )
+    context = scenes.CONTEXT._replace(moon=(1,), moon_ids=(7,))
+    effect = effect_by_name("moon_patch").of(context, q=[0.003], u=[-0.004])
+    assert effect.labels("q") == ("q.7",)
+    found = stokes(effect) - stokes()
     assert found[1] == pytest.approx([0.0, 0.003, -0.004, 0.0], abs=1e-15)
     assert not found[[0, 2]].any()
 
@@ -155,6 +151,21 @@ def test_standard_outlier_is_of_one_star():
     )  # ROTATOR 45°: q of the sky is −u here
     with pytest.raises(ValueError, match="red_star"):
         stokes(make("standard_outlier", source="redd_star"), rows=rows, source=(0, 1))
+
+
+def test_standard_values_are_of_each_star_by_itself():
+    """With ROTATOR 45° Q of the sky is −U of the instrument, and U of the sky is Q."""
+    rows = builders.exposures({"kind": "standard", "rotator": 0.0}, {"kind": "standard", "rotator": 45.0})
+    effect = make("standard_values", q=[0.02, 0.01], u=[-0.005, 0.03])
+    assert effect.labels("q") == ("q.blue_star", "q.red_star")
+    found = stokes(effect, rows=rows, source=(0, 1)) - stokes(rows=rows, source=(0, 1))
+    assert found[0] == pytest.approx([0.0, 0.02, -0.005, 0.0], abs=1e-15)
+    assert found[1] == pytest.approx([0.0, 0.03, -0.01, 0.0], abs=1e-15)
+
+
+def test_standard_values_need_a_standard():
+    effect = effect_by_name("standard_values").neutral(scenes.CONTEXT._replace(sources=()))
+    assert "there is no standard star" in effect.lacks(builders.south())
 
 
 def upstream(effect: Effect, x: float, y: float) -> np.ndarray:

@@ -14,7 +14,8 @@ Parameters are the keys that hold a table:
                 alike, `{choice}` a choice of the entry
     per_unit    amplitude of the change for one unit of the parameter (1)
     said        the same, to first order, in the grammar of a diagnosis, where that differs
-    each        "camera": one value for each of `every camera`; "moon exposure": for each exposure of the Moon
+    each        "camera": one value for each of `every camera`; "standard": for each of `every standard`;
+                "moon exposure": for each exposure of the Moon
     polar       name of the parameter of its angle: `does` has two changes, for cos and sin of `turns` × the angle
     absolute    true: the extinction itself instead of an addition to it; `neutral` is its value without the effect
     unit, about, width, scale, loose    as for `parameters.param`
@@ -59,7 +60,7 @@ PARAMETER_KEYS = (
     "does", "per_unit", "said", "each", "polar", "turns", "absolute", "neutral", "unit", "about", "width", "scale",
     "loose",
 )  # fmt: skip
-EACH = ("camera", "moon exposure")
+EACH = ("camera", "standard", "moon exposure")
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
 EffectKind = type[Effect] | Entry

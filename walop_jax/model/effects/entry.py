@@ -32,8 +32,14 @@ EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
     "camera": lambda instrument: instrument.cameras.names,
     "analyser": lambda instrument: [f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms],
     "wave_plate": lambda instrument: instrument.places(WavePlate),
+    "standard": lambda instrument: list(map(_one_word, instrument.standard.names)),
 }
 """Places of `every`."""
+
+
+def _one_word(name: str) -> str:
+    """The name of a star as changes and labels have it."""
+    return name.replace(" ", "_")
 
 
 class Member(NamedTuple):
@@ -126,18 +132,26 @@ class Entry:
 
     def neutral(self, context: Context) -> Named:
         """The effect at neutral values, with the first of all choices."""
-        count = {"camera": (len(context.cameras),), "moon exposure": (len(context.moon),)}
+        labels = {
+            "camera": [f"n{k}" for k in range(len(context.cameras))],
+            "moon exposure": list(map(str, context.moon_ids)),
+            "standard": list(map(_one_word, context.sources)),
+        }
         values = {
             member.name: as_number(
-                np.full(count.get(member.each, ()), context.extinction if member.absolute else member.neutral)
+                np.full(
+                    (len(labels[member.each]),) if member.each else (),
+                    context.extinction if member.absolute else member.neutral,
+                )
             )
             for member in self.members
         }
         first = {"cameras": 0, "stars": next(iter(context.sources), "")}
         chosen = tuple((name, first[of] if isinstance(of, str) else of[0]) for name, of in self.choices)
-        of_moon = any(member.each == "moon exposure" for member in self.members)
-        moon = tuple(zip(context.moon, context.moon_ids, strict=True)) if of_moon else ()
-        return Named(values=values, entry=self, chosen=chosen, moon=moon)
+        several = {member.each for member in self.members if member.each}
+        labelled = tuple((each, tuple(labels[each])) for each in sorted(several))
+        moon = context.moon if "moon exposure" in several else ()
+        return Named(values=values, entry=self, chosen=chosen, labelled=labelled, moon=moon)
 
     def of(self, context: Context, **values: Any) -> Named:
         """The effect with some values and choices, as `Effect.of`."""
@@ -172,13 +186,15 @@ class Entry:
 class Named(Effect):
     """An effect of an entry. Parameters and choices, by name, are its attributes as well.
 
-    `moon` holds position and EXPOSURE number of every exposure of the Moon with a value.
+    `labelled` are the labels of the values of an array, by what it has a value for each of (`Member.each`): the EXPOSURE
+    number of an exposure of the Moon, the name of a star. `moon` are the positions of the exposures of the Moon.
     """
 
     values: dict[str, Array]
     entry: Entry = eqx.field(static=True)
     chosen: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-    moon: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    labelled: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
+    moon: tuple[int, ...] = eqx.field(static=True)
 
     def __check_init__(self) -> None:
         chosen = self.choices()
@@ -204,14 +220,9 @@ class Named(Effect):
         return self.entry.name
 
     def labels(self, field: str) -> Sequence[str]:
-        """One name for each camera, or for each exposure of the Moon by its EXPOSURE number."""
-        index = next(member.each for member in self.entry.members if member.name == field)
-        if not index:
-            return (field,)
-        of_cameras = [f"n{k}" for k in range(len(self.values[field]))]
-        return tuple(
-            f"{field}.{label}" for label in (of_cameras if index == "camera" else [n for _, n in self.moon])
-        )
+        """One name for each camera, standard, or exposure of the Moon by its EXPOSURE number; else the field's own."""
+        each = next(member.each for member in self.entry.members if member.name == field)
+        return tuple(f"{field}.{label}" for label in dict(self.labelled)[each]) if each else (field,)
 
     def choices(self) -> dict[str, Any]:
         """The choices of its entry, with what was chosen."""
@@ -234,7 +245,7 @@ class Named(Effect):
 
     def lacks(self, instrument: Instrument) -> str:
         """The part that the instrument lacks for the effect, in words; also where no star is available for a choice."""
-        if "" in self.choices().values():
+        if "" in self.choices().values() or ("standard", ()) in self.labelled:
             return NO_STANDARD
         if not (arrangement := self.entry.arrangement):
             return super().lacks(instrument)
@@ -311,12 +322,12 @@ class Named(Effect):
         if "camera" in chosen:
             names = instrument.cameras.names
             chosen["camera"] = names[numbered_camera(self.name, chosen["camera"], names)]
-        text = text.format_map({name: str(value).replace(" ", "_") for name, value in chosen.items()})
+        text = text.format_map({name: _one_word(str(value)) for name, value in chosen.items()})
         expanded = list(_expanded(text, instrument))
-        if member.each == "camera":
+        if member.each in EVERY:
             return [[item] for item in expanded]
         if member.each:
-            return [[f"{item} * exposure {at}" for item in expanded] for at, _ in self.moon]
+            return [[f"{item} * exposure {at}" for item in expanded] for at in self.moon]
         return [expanded]
 
 
