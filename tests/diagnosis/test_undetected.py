@@ -1,5 +1,7 @@
 """Changes that the data would not show: their second moment by quadrature, and their errors in a product."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from fits_with import examined_with, fit_with
@@ -16,9 +18,11 @@ from walop_jax.diagnosis.discrepancy import (
     _carrying,
     _no_starlight,
     _of_other_light,
+    _of_stated_numbers,
     _second_moments,
     ambiguities,
 )
+from walop_jax.diagnosis.stated_conditions import condition_scores
 from walop_jax.model.effects import Described
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.posterior import draws
@@ -171,3 +175,61 @@ def test_draws_of_a_posterior_keep_what_is_undetected(sound, monkeypatch):
     np.testing.assert_allclose(np.sqrt(np.diag(moments.covariance)), sigma, rtol=0.06, atol=1e-7)
     whole = draws.with_draws(product, "posterior.nc", 4000).draws
     np.testing.assert_allclose(whole.std(axis=0), sigma, rtol=0.06, atol=1e-7)
+
+
+def with_lamp(calset, factor: float):
+    """The set with another colour of the lamp than the one it was taken with."""
+    e = calset.exposures
+    teff = np.where(e.clp_in, e.teff * factor, e.teff)
+    return dataclasses.replace(calset, exposures=dataclasses.replace(e, teff=teff))
+
+
+def test_a_wrong_colour_of_the_lamp_moves_the_parameters_as_a_fit_with_it_does(sound):
+    """E[c²] of TEFF by quadrature, times the shifts of a fit to the same counts with another TEFF."""
+    result, _, _ = sound
+    step = 0.01
+    other = fit_with(with_lamp(result.calset, 1.0 + step))
+    free = result.model.free
+    laid = LinearisedFit(examined_with(result))
+    numbers = condition_scores(laid.design, "TEFF of exposures of kind clp").items
+    (number,) = numbers
+    kelvin = float(np.median(result.calset.exposures.teff[result.calset.exposures.clp_in]))
+    shift = (other.values - result.values)[free] / (step * kelvin)
+    column = number.single.candidate.columns
+    left = laid.design.projector(laid.design.residual)
+    square, score = number.rest.item(), float(column[:, 0] @ left)
+    evidence, moment = 0.0, 0.0
+    for scale in (1.0, 0.3, 0.1, 0.03):
+        width = scale * 10.0 * 0.05 * kelvin
+        c = np.linspace(-8.0, 8.0, 200_001) * width
+        density = stats.norm.pdf(c, scale=width) * np.exp(-0.5 * square * c**2 - score * c) / 4
+        evidence += integrate.trapezoid(density, c)
+        moment += integrate.trapezoid(c**2 * density, c)
+    every = [one for one in condition_scores(laid.design).items if not one.stated.seen_by_stars]
+    asked = [one.single.candidate.name for one in every if one.alive.all()]
+    moment /= len(asked) - 1 + evidence  # one of them is expected
+    root = _of_stated_numbers(laid, laid.nothing_removed)
+    found = root[:, asked.index("TEFF of exposures of kind clp")]
+    errors = np.sqrt(np.diag(result.covariance)[free])
+    moved = np.sqrt(moment) * shift / errors
+    np.testing.assert_allclose(np.abs(found / errors), np.abs(moved), atol=0.05 * np.abs(moved).max())
+
+
+def test_a_wrong_colour_of_the_lamp_is_in_the_errors_of_a_product():
+    """A lamp that is called hotter by 30 % moves an element of the matrix by many errors of the fit, and χ² by few."""
+    simulation = simulate(SMALL, seed=3)
+    result = fit_with(with_lamp(simulation.calset, 1.3))
+    assert result.explains_data
+    shape = ambiguities(examined_with(result), {}).undetected
+    points, calset = result.calset.points, simulation.calset
+    setting = first_setting(calset, simulation.truth)
+    plan = plan_for_settings(simulation.truth, setting, calset.filters)
+    true = planned_matrices(simulation.truth, plan, points.x, points.y).reshape(len(points.x), 6)
+    worst = []
+    for product in (Calibration.from_fit(result.with_verdict()), product_of(result, shape)):
+        m, c = product.matrix(points.x, points.y, setting)
+        pulls = np.abs(m - true) / np.sqrt(np.diagonal(c, axis1=1, axis2=2))
+        worst.append(np.median(pulls, axis=0).max())
+    print(worst)
+    assert worst[0] > 4.0
+    assert worst[1] < 2.0

@@ -143,7 +143,7 @@ OF_THE_SOURCE = {  # and of the polariser: no part of what is said of the instru
     "moon_patch": {"q": 0.01, "u": 0.01},
     "rotator_zero": {"angle": 2.0},
     "standard_outlier": {"source": "q", "q": 0.02},
-    "standard_values": {"q": [0.02, -0.01], "u": [0.01, 0.03]},
+    "standard_values": {"q": [0.02, -0.01, 0.01], "u": [0.01, 0.03, 0.0]},
     "standard_colour": {"source": "q", "q": 0.02},
     "standard_drift": {"source": "q", "q": 0.02},
     "standard_angles": {"angle": 1.0},

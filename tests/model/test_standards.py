@@ -162,7 +162,9 @@ def test_the_slope_inside_a_band_is_in_the_counts():
     assert np.abs(modelled - exact).max() < 0.1 * np.abs(without - exact).max()
 
 
-@pytest.mark.parametrize("name", ["standard_colour", "standard_drift", "standard_values", "standard_angles", "standard_degrees"])
+@pytest.mark.parametrize(
+    "name", ["standard_colour", "standard_drift", "standard_values", "standard_angles", "standard_degrees"]
+)
 def test_columns_of_what_standards_may_do(name):
     """Columns from slots against the derivative of the whole light path, for stars with a colour in two filters."""
     run = simulate(BOTH, seed=3)

@@ -21,7 +21,10 @@ Undetected   With elements that the model does not let vary, the matrix has erro
              is added to the covariance; values stay those of the fit. A change that the data exclude adds nothing; one
              of which the data say nothing adds its prior variance; one that they suggest without an alarm adds its
              size. One more change is expected among the candidates that act on calibration exposures and not on stars
-             (in time, temperature, KIND, counts, single exposures): it only shifts the parameters.
+             (in time, temperature, KIND, counts, single exposures), and one among the numbers that the set states and
+             the data measure (TEFF, ROTATOR, the clock, coordinates), which may be wrong by up to ten of their standard
+             errors (`thresholds.MOST_WIDTHS`): these only shift the parameters. Numbers of which the data say nothing
+             are those of `undetected_errors`.
 Starlight    To first order any such change acts on a star like a change ahead of the train. A few changes there, chosen
              one after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
@@ -48,6 +51,7 @@ from walop_jax.diagnosis.examination import Examination
 from walop_jax.diagnosis.grammar import FEWEST_POINTS, Dependences, places_of
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import SCALES, log_bayes_by_scale
+from walop_jax.diagnosis.stated_conditions import condition_scores
 from walop_jax.fit.refit import FitResult
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.columns import Columns
@@ -256,6 +260,7 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
         for block, moment in zip(tried, moments, strict=True)
     ]
     factors.append(laid.slopes @ _of_other_light(laid, step))
+    factors.append(laid.slopes @ _of_stated_numbers(laid, step))
     errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
     factor = (np.concatenate(factors, axis=-1) / errors).reshape(laid.errors.size, -1)
     ahead = blocks[front]
@@ -369,6 +374,34 @@ def _of_other_light(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
         moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.scatter)
         covariance += slopes[:, at] @ moment @ slopes[:, at].T
     return square_root(covariance)
+
+
+def _of_stated_numbers(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
+    """F, with F Fᵀ the covariance of the free parameters by numbers of the set that may be wrong, each there or not.
+
+    These are the numbers that the data measure. What stars are observed under as well, the wavelengths of a filter, is
+    left out: what the parameters take up of it is right for stars.
+    """
+    numbers = [
+        number
+        for number in condition_scores(laid.design).items
+        if number.alive.all() and not number.stated.seen_by_stars and number.stated.error > 0.0
+    ]
+    if not numbers:
+        return np.zeros((len(laid.fit.model.free), 0))
+    columns = np.hstack([number.single.candidate.columns for number in numbers])
+    scores, odds, scatter = step.projector(columns).T @ step.left, _odds(len(numbers)), laid.state.scatter
+    moments = [
+        _second_moment(
+            np.diag(number.rest),
+            score,
+            np.array([thresholds.MOST_WIDTHS * number.stated.error]),
+            odds,
+            scatter,
+        ).item()
+        for number, score in zip(numbers, scores[:, None], strict=True)
+    ]
+    return -step.projector.taken_up(step.projector.basis.T @ columns) * np.sqrt(moments)
 
 
 def _no_starlight(probe: Probe, template: Instrument) -> bool:
