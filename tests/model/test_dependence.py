@@ -145,8 +145,8 @@ def check_jacobian(*effects: Effect) -> tuple[list[str], np.ndarray]:
 GROUPS = {
     "sky and polariser": (
         "moon_multiple_scattering", "moon_patch", "rotator_zero", "standard_outlier", "standard_values",
-        "standard_colour", "standard_drift", "standard_angles", "standard_degrees", "telescope_polarisation", "clp_zero", "clp_wobble",
-        "clp_extinction", "clp_ellipticity",
+        "standard_colour", "standard_drift", "standard_angles", "standard_degrees", "telescope_polarisation",
+        "clp_zero", "clp_wobble", "clp_extinction", "clp_ellipticity",
     ),
     "lenses and calibration plate": (
         "lens_birefringence", "upstream_retarder", "chwp_in_beam", "chwp_axis", "chwp_thickness",

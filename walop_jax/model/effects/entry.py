@@ -186,8 +186,8 @@ class Entry:
 class Named(Effect):
     """An effect of an entry. Parameters and choices, by name, are its attributes as well.
 
-    `labelled` are the labels of the values of an array, by what it has a value for each of (`Member.each`): the EXPOSURE
-    number of an exposure of the Moon, the name of a star. `moon` are the positions of the exposures of the Moon.
+    `labelled` are the labels of the values of an array, by what there is a value for each of (`Member.each`): the
+    EXPOSURE number of an exposure of the Moon, the name of a star. `moon` are the positions of the Moon exposures.
     """
 
     values: dict[str, Array]
