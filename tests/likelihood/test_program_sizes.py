@@ -13,7 +13,7 @@ from jax.extend import core
 from small_run import SMALL
 
 from walop_jax.fit.base_model import base_model
-from walop_jax.likelihood import columns, engine
+from walop_jax.likelihood import columns, engine, optics
 from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.simulation.simulate import simulate
 
@@ -50,12 +50,19 @@ def likelihood():
     return Likelihood.of(calset, base_model(calset))
 
 
-@pytest.mark.parametrize(("program", "most"), [(engine.residuals, 1300), (engine.linearised_residuals, 3850)])
-def test_programs_of_a_fit_stay_small(likelihood, program, most):
-    instrument = likelihood.model.instrument(likelihood.model.start)
+def test_programs_of_a_fit_stay_small(likelihood):
+    """Residuals; their derivatives are two programs, of the optics and of all that is behind them."""
+    instrument, plan = likelihood.model.instrument(likelihood.model.start), likelihood.plan
     batch = next(iter(likelihood.points))
-    found = jax.make_jaxpr(program.__wrapped__)(instrument, likelihood.plan, batch)
-    assert 0.5 * most < equations(found.jaxpr) < most
+    known = engine.solved_optics(instrument, plan, batch)
+    programs = {
+        1300: (engine.residuals, (instrument, plan, batch)),
+        1900: (optics._solved, (instrument, plan, batch.x, batch.y)),
+        1100: (engine._linearised_residuals, (instrument, plan, batch, known)),
+    }
+    for most, (program, args) in programs.items():
+        found = jax.make_jaxpr(program.__wrapped__)(*args)
+        assert 0.5 * most < equations(found.jaxpr) < most
 
 
 def test_the_program_of_the_responses_stays_small(likelihood):

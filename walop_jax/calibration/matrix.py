@@ -25,14 +25,14 @@ from walop_jax.fit.verdict import Structure
 from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import accurate_table, details_of, in_batches
-from walop_jax.likelihood.optics import linearised, plain_positions, through_series
+from walop_jax.likelihood.optics import Solved, directions, linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import compiled, usual_threads
+from walop_jax.model.compiled import array, compiled, usual_threads
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light_path import Scalar
 from walop_jax.model.parameters import values_of, with_values
-from walop_jax.model.plan import Plan, with_numbers
+from walop_jax.model.plan import Plan
 from walop_jax.model.planning import plan_for_settings
 from walop_jax.model.specification import Model, series_indices
 
@@ -138,47 +138,48 @@ class ResidualMap:
 # ------------------------------------------------------------------------------------ vectors and their derivatives
 
 
-def point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-    """Analysis vectors (band, camera, Stokes) at a field point for light behind the telescope, as a computation."""
-    rows = light.band_rows(instrument, plan, x, y)
-    return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
-
-
 def _vectors_at(
-    instrument: Instrument, plan: Plan, x: Float[Array, " p"], y: Float[Array, " p"]
+    instrument: Instrument, rows: Float[Array, "p b r 4"], x: Float[Array, " p"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 4"], Float[Array, "p 4 4"]]:
-    """Analysis vectors for light behind the telescope, and the Mueller matrix of the telescope."""
-    vectors = jax.vmap(functools.partial(point_vectors, instrument, plan))(x, y)
-    return vectors, jax.vmap(functools.partial(light.telescope, instrument))(x, y)
+    """Analysis vectors for light behind the telescope from known band rows, and the Mueller matrix of the telescope."""
+
+    def vectors(rows: light.Rows, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+        return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
+
+    return jax.vmap(vectors)(rows, x, y), jax.vmap(functools.partial(light.telescope, instrument))(x, y)
 
 
 def _slopes_at(
-    instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]
+    instrument: Instrument, plan: Plan, known: Solved, x: Float[Array, " p"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
-    """Analysis vectors (p, b, k, 3) for light from the sky, and their derivatives (p, d, b, k, 3).
+    """Analysis vectors (p, b, k, 3) for light from the sky, and their derivatives (p, d, b, k, 3), from known optics.
 
-    `columns` are x and y (deg) and, if they are not those of the plan, colour temperature (K, 0: flat), temperature and
-    hour angle. Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the field
-    point.
+    Derivatives are in all parameters but the terms of the throughput, then in the throughputs at the field point.
     """
+    to_instrument, index = with_values(instrument), jnp.asarray(directions(instrument, plan).index)
 
-    def one(x: Scalar, y: Scalar, *numbers: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
-        settings, to_instrument = with_numbers(plan, *numbers) if numbers else plan, with_values(instrument)
-
+    def one(known: Solved, x: Scalar, y: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
         def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
-            changed, rows = to_instrument(values), optics.band_rows(values, instrument, settings, x, y)
+            changed, rows = to_instrument(values), optics.with_slopes(values, *known, index)
             seen = light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y)
             return seen[..., :3]
 
         derivatives = linearised(instrument, vectors, instrument.throughput.at(x, y))
         return derivatives.value, jnp.concatenate([derivatives.plain, derivatives.local])
 
-    return jax.vmap(one)(*columns)
+    return jax.vmap(one)(known, x, y)
 
 
-_vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
-_slopes = compiled(_slopes_at, kept_as="slopes")  # of hundreds of places after every fit
-_slopes_once = compiled(_slopes_at, optimised_above=limits.FEW_PLACES, kept_as="slopes_once")
+_seen_vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
+_seen_slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="slopes")
+
+
+def _slopes(
+    instrument: Instrument, plan: Plan, *columns: OfPoints
+) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
+    """Analysis vectors and derivatives as of `_slopes_at`; `columns` as of `optics.solved`."""
+    x, y, *numbers = map(array, columns)
+    return _seen_slopes(instrument, plan, optics.solved(instrument, plan, x, y, *numbers), x, y)
 
 
 def analysis_vectors(
@@ -186,7 +187,12 @@ def analysis_vectors(
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
-    vectors, telescope = _in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
+
+    def seen(x: OfPoints, y: OfPoints) -> tuple[Any, Any]:
+        at = array(x), array(y)
+        return _seen_vectors(instrument, optics.rows_at(instrument, plan, *at), *at)
+
+    vectors, telescope = _in_chunks(seen, x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
 
 
@@ -229,15 +235,13 @@ def of_matrix(
     return (added[..., i, :] - added[..., j, :] - common) / total
 
 
-def _matrix_and_slopes(
-    instrument: Instrument, plan: Plan, program: Callable[..., Any] = _slopes
-) -> Callable[..., tuple[Matrices, Slopes]]:
-    """A function of rows as those of `_slopes_at`: matrices in the one band of the plan, and their derivatives."""
+def _matrix_and_slopes(instrument: Instrument, plan: Plan) -> Callable[..., tuple[Matrices, Slopes]]:
+    """A function of columns as those of `_slopes`: matrices in the one band of the plan, and their derivatives."""
     plain, series = plain_positions(instrument), series_indices(instrument)
     size, pairs = values_of(instrument).size, instrument.cameras.pairs
 
     def at(*columns: OfPoints) -> tuple[np.ndarray, np.ndarray]:
-        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in program(instrument, plan, *columns))
+        vectors, slopes = (np.asarray(d)[..., 0, :, :] for d in _slopes(instrument, plan, *columns))
         change = np.moveaxis(of_matrix(vectors[:, None], slopes, pairs), 1, -1)
         basis = instrument.throughput.basis(*columns[:2])[:, None, None, None]
         result = np.empty((*change.shape[:-1], size))
@@ -307,21 +311,16 @@ def matrix_slopes(
     filters: Filters,
     x: OfPoints,
     y: OfPoints,
-    *,
-    once: bool = False,
 ) -> tuple[Matrices, Slopes]:
     """Instrument matrix (point, arm, element) at positions in degrees, and its derivatives to all parameters.
 
-    `setting` has one row. `once` says that hardly more than these places will be asked of a model with these effects,
-    such as one in the course of a diagnosis: few of them are not worth an optimised program. Raises KeyError for a
-    filter that `filters` does not hold.
+    `setting` has one row. Raises KeyError for a filter that `filters` does not hold.
     """
     if not instrument.cameras.pairs:  # no row, and nothing to compile
         return np.zeros((len(x), 0, 3)), np.zeros((len(x), 0, 3, values_of(instrument).size))
     plan = dataclasses.replace(plan_for_settings(instrument, setting, filters), work=len(x))
     numbers = (np.broadcast_to(number, len(x)) for number in _numbers(setting))
-    program = _slopes_once if once else _slopes
-    return _in_chunks(_matrix_and_slopes(instrument, plan, program), x, y, *numbers)
+    return _in_chunks(_matrix_and_slopes(instrument, plan), x, y, *numbers)
 
 
 def slopes_over_field(

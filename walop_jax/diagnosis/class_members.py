@@ -119,7 +119,7 @@ class LinearisedFit:
         instrument = model.instrument(self.fit.values)
         setting = first_setting(calset, instrument, self.usual)
         at = setting, calset.filters, calset.points.x, calset.points.y
-        matrix, slopes = matrix_slopes(instrument, *at, once=True)
+        matrix, slopes = matrix_slopes(instrument, *at)
         self.matrix = matrix.reshape(len(matrix), -1)
         self.slopes = slopes.reshape(*self.matrix.shape, -1) @ model.selection()
         self.covariance = self.fit.covariance[np.ix_(model.free, model.free)]

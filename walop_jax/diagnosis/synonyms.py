@@ -121,7 +121,7 @@ def _changes(
     place = {total: number for number, total in enumerate(every)}
     instrument, points = fit.model.instrument(fit.values), fit.calset.points
     setting = first_setting(fit.calset, instrument, usual)
-    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x, points.y, once=True)
+    matrix, slopes = matrix_slopes(instrument, setting, fit.calset.filters, points.x, points.y)
     slopes = slopes.reshape(len(matrix), -1, slopes.shape[-1]) @ fit.model.selection()
     covariance = fit.covariance[np.ix_(fit.model.free, fit.model.free)]
     # Of data as stated: of a fit that is far off any two products would be the same.

@@ -130,7 +130,7 @@ def examined(
     if near:
         singles = Singles.of(design)
         # The product of a diagnosis has further effects.
-        hidden = undetected_errors(design, singles, once=diagnosed is not None)
+        hidden = undetected_errors(design, singles)
         candidates = diagnosed.candidates if diagnosed else candidate_scores(design, seed, singles)
         design.columns.forget()  # responses of a thousand points, ahead of the large matrices of the patterns
         doubts = (

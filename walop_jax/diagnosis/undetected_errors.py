@@ -63,8 +63,8 @@ class _Mistake(NamedTuple):
     acts: bool = False
 
 
-def undetected_errors(design: Design, singles: Singles, *, once: bool = False) -> Hidden:
-    """Single mistakes at the largest size that hides (h above), and their consequences; `once` as in `matrix_slopes`.
+def undetected_errors(design: Design, singles: Singles) -> Hidden:
+    """Single mistakes at the largest size that hides (h above), and their consequences.
 
     Kept are those that move the parameters by more than their standard errors, effects that act on starlight, and
     effects of elements out of the beam in the usual setting on which the data hold no information; first those that
@@ -73,7 +73,7 @@ def undetected_errors(design: Design, singles: Singles, *, once: bool = False) -
     fit = design.fit
     places = np.unique(np.linspace(0, len(fit.calset.points) - 1, STAR_POINTS).astype(int))
     exposure = usual_exposure(fit.calset, fit.model.template)
-    of_stars = Starlight(design, singles.asked, exposure, places, once=once)
+    of_stars = Starlight(design, singles.asked, exposure, places)
     instrument, mistakes = of_stars.instrument, list(_mistakes(singles, of_stars))
     along = np.array([m.along for m in mistakes]).reshape(len(mistakes), -1).T
     changes = (fit.model.selection() @ design.projector.taken_up(along)).T
@@ -143,10 +143,8 @@ class Starlight:
         asked: Sequence[Probe],
         exposure: int,
         places: Int[np.ndarray, " p"],
-        *,
-        once: bool = False,
     ) -> None:
-        self.fit, self.asked, self.places, self.once = design.fit, asked, places, once
+        self.fit, self.asked, self.places = design.fit, asked, places
         self.parameters = design.projector.basis.shape[1]
         template, calset = self.fit.model.template, self.fit.calset
         self.instrument = self.fit.model.instrument(self.fit.values)
@@ -213,7 +211,7 @@ class Starlight:
         """
         calset, errors = self.fit.calset, np.zeros((len(changes), len(self.places)))
         x, y = calset.points.x[self.places], calset.points.y[self.places]
-        matrix, slopes = matrix_slopes(self.instrument, self.setting, calset.filters, x, y, once=self.once)
+        matrix, slopes = matrix_slopes(self.instrument, self.setting, calset.filters, x, y)
         for i, (change, by) in enumerate(zip(changes, moved, strict=True)):
             errors[i] = change_of_qu(matrix, matrix + (change - slopes @ by))
         return errors

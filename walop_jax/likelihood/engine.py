@@ -27,9 +27,9 @@ from jaxtyping import Array, Float, Int
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
-from walop_jax.likelihood.optics import LocalDerivatives, linearised, plain_positions, to_all
+from walop_jax.likelihood.optics import LocalDerivatives, Solved, linearised, plain_positions, to_all
 from walop_jax.model import light
-from walop_jax.model.compiled import compiled
+from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.light import Counts
 from walop_jax.model.parameters import ParameterVector, values_of, with_values
@@ -37,18 +37,8 @@ from walop_jax.model.plan import Plan
 from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
 
-
-class HeldSlopes(NamedTuple):
-    """Derivatives of the band rows in the parameters of `optics.directions`, at the sites of a point, held as they are.
-
-    The rows themselves remain exact. Without derivatives they take a tenth of the time, and normal equations a third.
-    """
-
-    slopes: Float[Array, "m o b r 4"]
-
-
 Flux = Float[Array, "e f"]
-Nodes = FieldTable | HeldSlopes | None
+Nodes = FieldTable | Solved | None
 NEWTON_STEPS = 3  # each squares the fraction of the detectors' distortion that is missing from the flux
 
 
@@ -105,23 +95,21 @@ def rows_at(
     sites = field_sites(template, point)
     if nodes is None:
         return jax.vmap(optics.band_rows, (None, None, None, 0, 0))(values, template, plan, *sites)
-    if isinstance(nodes, HeldSlopes):
-        there, slopes = with_values(template)(jax.lax.stop_gradient(values)), nodes.slopes
+    rows, slopes = nodes if isinstance(nodes, Solved) else nodes(*sites)
+    if rows is None:
+        there = with_values(template)(jax.lax.stop_gradient(values))
         rows = jax.vmap(light.band_rows, (None, None, 0, 0))(there, plan, *sites)
-    else:
-        rows, slopes = nodes(*sites)
     index = jnp.asarray(optics.directions(template, plan).index)
     return optics.with_slopes(values, rows, jnp.swapaxes(slopes, 0, 1), index)
 
 
-def held_slopes(instrument: Instrument, plan: Plan, data: PointData) -> HeldSlopes:
-    """The derivatives of the band rows at the sites of all points."""
-
-    def at(point: PointData) -> Float[Array, "m o b r 4"]:
-        sites = field_sites(instrument, point)
-        return jax.vmap(optics.rows_and_slopes, (None, None, 0, 0))(instrument, plan, *sites)[1]
-
-    return HeldSlopes(jax.vmap(at)(data))
+def solved_optics(instrument: Instrument, plan: Plan, data: PointData) -> Solved:
+    """Band rows and their derivatives at the sites of all points, which are the leading axes (p, m)."""
+    x, y = data.x, data.y
+    if light.has_ghosts(instrument):
+        x, y = (array(np.stack([at, -np.asarray(at)], axis=1).ravel()) for at in (x, y))
+    known = optics.solved(instrument, plan, x, y)
+    return jax.tree.map(lambda leaf: leaf.reshape(len(data.x), -1, *leaf.shape[1:]), known)
 
 
 def throughput_at(instrument: Instrument, point: PointData) -> Float[Array, "m k"]:
@@ -322,7 +310,7 @@ def block_equations(
 ) -> NormalEquations:
     """The normal equations of some points, each in its local quantities first: far fewer products than of all columns.
 
-    `HeldSlopes` are those of all points.
+    `Solved` optics are those of all points.
     """
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
@@ -333,7 +321,7 @@ def block_equations(
         r, jacobian, _ = _point_jacobian(instrument, plan, point, nodes)
         return r @ r, jacobian @ r, jacobian @ jacobian.T
 
-    each = 0 if isinstance(nodes, HeldSlopes) else None
+    each = 0 if isinstance(nodes, Solved) else None
     chi2, gradient, gram = jax.vmap(of_point, (0, each))(data, nodes)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
@@ -367,13 +355,21 @@ class Linearised(NamedTuple):
     flux: Float[Any, "p e f"]
 
 
-def residuals_and_slopes(instrument: Instrument, plan: Plan, data: PointData) -> Linearised:
-    """All residuals, their derivatives, and the best fluxes."""
-    residual, local, flux = jax.vmap(_point_jacobian, in_axes=(None, None, 0))(instrument, plan, data)
+def residuals_and_slopes(
+    instrument: Instrument, plan: Plan, data: PointData, known: Solved | None = None
+) -> Linearised:
+    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all points."""
+    each = None if known is None else 0
+    residual, local, flux = jax.vmap(_point_jacobian, (None, None, 0, each))(instrument, plan, data, known)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size
     spread = jax.vmap(lambda columns, at: to_all(instrument, columns[:count], columns[count:], at))
     return Linearised(residual, spread(local, basis), flux)
+
+
+def linearised_residuals(instrument: Instrument, plan: Plan, data: PointData) -> Linearised:
+    """`residuals_and_slopes` by two programs: of the optics (`optics.solved`), and of all that is behind them."""
+    return _linearised_residuals(instrument, plan, data, solved_optics(instrument, plan, data))
 
 
 def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:
@@ -383,7 +379,7 @@ def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Arr
 incoming = compiled(jax.vmap(_incoming, (None, None, 0)), kept_as="incoming")
 """Stokes vectors that enter the collimator."""
 _table_equations = compiled(_on_table, kept_as="table_equations")
-linearised_residuals = compiled(
+_linearised_residuals = compiled(
     residuals_and_slopes, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="linearised_residuals"
 )
 star_responses = compiled(_star_responses, kept_as="star_responses")

@@ -29,10 +29,10 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.optics import rows_and_slopes
+from walop_jax.likelihood.optics import solved
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
-from walop_jax.model.compiled import array, compiled
+from walop_jax.model.compiled import array
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.plan import Plan
 
@@ -154,12 +154,10 @@ Optics = tuple[Float[np.ndarray, "p b r 4"], Float[np.ndarray, "p o b r 4"]]
 
 TOLERANCE = 2e-10
 
-_solve = compiled(jax.vmap(rows_and_slopes, in_axes=(None, None, 0, 0)), kept_as="nodes")
-
 
 def solved_optics(instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
-    return in_batches(lambda x, y: _solve(instrument, plan, array(x), array(y)), x, y)
+    return tuple(in_batches(lambda x, y: solved(instrument, plan, array(x), array(y)), x, y))
 
 
 def in_batches(

@@ -68,9 +68,6 @@ BLOCKS = (16, 128)
 
 MATRIX_POINTS = 32
 """Field points whose matrices or analysis vectors are computed together, for one star as for a map: one program."""
-FEW_PLACES = 256
-"""Places up to which derivatives of the matrix come from a program that is not optimised: it is compiled in a fifth of
-the time, and takes four times as long to run, 1.3 ms a place."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 
@@ -82,7 +79,8 @@ OPTIMISED_ABOVE = 6000
 """(Exposure, point) pairs above which programs are optimised: they are compiled in three times the time, and run in a
 third of it."""
 OFTEN_OPTIMISED_ABOVE = 1500
-"""The same for derivatives of residuals, which a fit asks for some ten times."""
+"""The same for derivatives of optics and residuals, which a fit asks for some ten times, and for places at which
+derivatives of the matrix are asked."""
 SELDOM_OPTIMISED_ABOVE = 15_000
 """The same for responses, which one likelihood asks for once: an optimised program takes 6 s more to compile, and saves
 0.1 s for 16 points."""
