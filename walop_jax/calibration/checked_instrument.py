@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from walop_jax.calibration.matrix import analysis_vectors
+from walop_jax.calibration.matrix import point_vectors
 from walop_jax.fit.model_file import model_without_data
 from walop_jax.io.display import Display, Displayed
 from walop_jax.io.errors import DataError, PathLike
@@ -89,8 +90,8 @@ def checked(source: PathLike) -> CheckedInstrument:
     requirements = needs(design)
     plan = blank_plan(design, requirements.conditions, requirements.median)
     edge = OFF_AXIS * min(design.field_limit, LARGEST_FIELD)
-    places = np.array([0.0, edge]), np.array([0.0, -edge])
-    for x, y, vectors in zip(*places, analysis_vectors(design, plan, *places), strict=True):
+    for x, y in ((0.0, 0.0), (edge, -edge)):
+        vectors = np.asarray(jax.jit(point_vectors)(design, plan, jnp.asarray(x), jnp.asarray(y)))
         if not np.isfinite(vectors).all():
             raise DataError(f"{design.name}: the optics are not finite at ({x:g}, {y:g}) deg")
         # A camera gives no less than nothing for any light, if its vector is longer in I than in (Q, U, V).

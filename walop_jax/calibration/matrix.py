@@ -138,15 +138,18 @@ class ResidualMap:
 # ------------------------------------------------------------------------------------ vectors and their derivatives
 
 
+def point_vectors(instrument: Instrument, plan: Plan, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
+    """Analysis vectors (band, camera, Stokes) at a field point for light behind the telescope, as a computation."""
+    rows = light.band_rows(instrument, plan, x, y)
+    return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
+
+
 def _vectors_at(
-    instrument: Instrument, rows: Float[Array, "p b r 4"], x: Float[Array, " p"], y: Float[Array, " p"]
+    instrument: Instrument, plan: Plan, x: Float[Array, " p"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 4"], Float[Array, "p 4 4"]]:
-    """Analysis vectors for light behind the telescope from known band rows, and the Mueller matrix of the telescope."""
-
-    def vectors(rows: light.Rows, x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
-        return light.camera_vectors(instrument, rows, instrument.throughput.at(x, y), x, y)
-
-    return jax.vmap(vectors)(rows, x, y), jax.vmap(functools.partial(light.telescope, instrument))(x, y)
+    """Analysis vectors for light behind the telescope, and the Mueller matrix of the telescope."""
+    vectors = jax.vmap(functools.partial(point_vectors, instrument, plan))(x, y)
+    return vectors, jax.vmap(functools.partial(light.telescope, instrument))(x, y)
 
 
 def _slopes_at(
@@ -170,7 +173,7 @@ def _slopes_at(
     return jax.vmap(one)(known, x, y)
 
 
-_seen_vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
+_vectors = compiled(_vectors_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="vectors")
 _seen_slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="slopes")
 
 
@@ -179,7 +182,8 @@ def _slopes(
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
     """Analysis vectors and derivatives as of `_slopes_at`; `columns` as of `optics.solved`."""
     x, y, *numbers = map(array, columns)
-    return _seen_slopes(instrument, plan, optics.solved(instrument, plan, x, y, *numbers), x, y)
+    of_maps = dataclasses.replace(plan, work=limits.MAP_PLACES)
+    return _seen_slopes(instrument, plan, optics.solved(instrument, of_maps, x, y, *numbers), x, y)
 
 
 def analysis_vectors(
@@ -187,12 +191,7 @@ def analysis_vectors(
 ) -> Float[np.ndarray, "p b k 4"]:
     """Analysis vectors (point, band, camera, Stokes) at field positions (deg), behind the telescope or `from_sky`."""
     plan = dataclasses.replace(plan, work=len(x))
-
-    def seen(x: OfPoints, y: OfPoints) -> tuple[Any, Any]:
-        at = array(x), array(y)
-        return _seen_vectors(instrument, optics.rows_at(instrument, plan, *at), *at)
-
-    vectors, telescope = _in_chunks(seen, x, y)
+    vectors, telescope = _in_chunks(lambda a, b: _vectors(instrument, plan, a, b), x, y)
     return vectors @ telescope[:, None] if from_sky else vectors
 
 

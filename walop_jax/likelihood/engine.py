@@ -104,11 +104,15 @@ def rows_at(
 
 
 def solved_optics(instrument: Instrument, plan: Plan, data: PointData) -> Solved:
-    """Band rows and their derivatives at the sites of all points, which are the leading axes (p, m)."""
+    """Band rows and their derivatives at the sites of all points, one point after the other (p m)."""
     x, y = data.x, data.y
     if light.has_ghosts(instrument):
         x, y = (array(np.stack([at, -np.asarray(at)], axis=1).ravel()) for at in (x, y))
-    known = optics.solved(instrument, plan, x, y)
+    return optics.solved(instrument, plan, x, y)
+
+
+def _by_point(known: Any, data: PointData) -> Any:
+    """Optics of sites one after the other by point (p, m)."""
     return jax.tree.map(lambda leaf: leaf.reshape(len(data.x), -1, *leaf.shape[1:]), known)
 
 
@@ -310,7 +314,7 @@ def block_equations(
 ) -> NormalEquations:
     """The normal equations of some points, each in its local quantities first: far fewer products than of all columns.
 
-    `Solved` optics are those of all points.
+    `Solved` optics are those of all sites (`solved_optics`).
     """
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
@@ -321,7 +325,7 @@ def block_equations(
         r, jacobian, _ = _point_jacobian(instrument, plan, point, nodes)
         return r @ r, jacobian @ r, jacobian @ jacobian.T
 
-    each = 0 if isinstance(nodes, Solved) else None
+    each, nodes = (0, _by_point(nodes, data)) if isinstance(nodes, Solved) else (None, nodes)
     chi2, gradient, gram = jax.vmap(of_point, (0, each))(data, nodes)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
@@ -358,8 +362,8 @@ class Linearised(NamedTuple):
 def residuals_and_slopes(
     instrument: Instrument, plan: Plan, data: PointData, known: Solved | None = None
 ) -> Linearised:
-    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all points."""
-    each = None if known is None else 0
+    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all sites (`solved_optics`)."""
+    each, known = (None, None) if known is None else (0, _by_point(known, data))
     residual, local, flux = jax.vmap(_point_jacobian, (None, None, 0, each))(instrument, plan, data, known)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
     count = plain_positions(instrument).size

@@ -68,6 +68,9 @@ BLOCKS = (16, 128)
 
 MATRIX_POINTS = 32
 """Field points whose matrices or analysis vectors are computed together, for one star as for a map: one program."""
+MAP_PLACES = 2000
+"""Places at which derivatives of the matrix are asked of a model once it is fitted, in maps and errors: so many are
+worth an optimised program of the optics, 0.4 ms a place instead of 2.4 ms."""
 
 # ------------------------------------------------------------------------------------------------- diagnosis
 
@@ -79,8 +82,7 @@ OPTIMISED_ABOVE = 6000
 """(Exposure, point) pairs above which programs are optimised: they are compiled in three times the time, and run in a
 third of it."""
 OFTEN_OPTIMISED_ABOVE = 1500
-"""The same for derivatives of optics and residuals, which a fit asks for some ten times, and for places at which
-derivatives of the matrix are asked."""
+"""The same for derivatives of optics and residuals, which a fit asks for some ten times."""
 SELDOM_OPTIMISED_ABOVE = 15_000
 """The same for responses, which one likelihood asks for once: an optimised program takes 6 s more to compile, and saves
 0.1 s for 16 points."""

@@ -41,14 +41,14 @@ from walop_jax.likelihood import limits
 from walop_jax.model import light
 from walop_jax.model.compiled import compiled, derivatives
 from walop_jax.model.conventions import Units
-from walop_jax.model.dependence import optical_reach
+from walop_jax.model.dependence import needs, optical_reach
 from walop_jax.model.effects import Change, Described
 from walop_jax.model.effects.change import AtPoint
 from walop_jax.model.effects.factors import values_at
 from walop_jax.model.effects.optics import Displaced
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import ParameterVector, Scalar, by_shapes, leaves, values_of, with_values
-from walop_jax.model.plan import Plan, with_numbers
+from walop_jax.model.plan import Plan, blank_plan, with_numbers
 from walop_jax.model.specification import series_indices
 
 
@@ -224,25 +224,9 @@ def solved(instrument: Instrument, plan: Plan, *columns: Float[Any, " p"]) -> So
     return _solved(*_of_optics(instrument, plan), *columns)
 
 
-def _rows_at(
-    instrument: Instrument, plan: Plan, x: Float[Array, " p"], y: Float[Array, " p"]
-) -> Float[Array, "p b r 4"]:
-    return jax.vmap(light.band_rows, (None, None, 0, 0))(instrument, plan, x, y)
-
-
-_rows = compiled(_rows_at, optimised_above=limits.OPTIMISED_ABOVE, kept_as="rows")
-
-
-def rows_at(
-    instrument: Instrument, plan: Plan, x: Float[Any, " p"], y: Float[Any, " p"]
-) -> Float[Array, "p b r 4"]:
-    """Band rows at field points (deg), by a program of their own: as those of `solved`, in a fifth of the time."""
-    return _rows(*_of_optics(instrument, plan), x, y)
-
-
 def _of_optics(instrument: Instrument, plan: Plan) -> tuple[Instrument, Plan]:
     """What programs of the optics depend on: not the exposures, and no effect of which no parameter changes a row."""
-    kept = itertools.compress(instrument.effects, _changes_rows(instrument, plan))
+    kept = itertools.compress(instrument.effects, _changes_rows(instrument) if instrument.effects else ())
     of_exposures = jax.tree.map(_emptied, (plan.exposures, plan.band_of))
     bare = eqx.tree_at(lambda p: (p.exposures, p.band_of), plan, of_exposures)
     return dataclasses.replace(instrument, effects=tuple(kept)), bare
@@ -253,9 +237,13 @@ def _emptied(leaf: Any) -> np.ndarray:
 
 
 @by_shapes
-def _changes_rows(instrument: Instrument, plan: Plan) -> tuple[bool, ...]:
-    """For every effect, whether one of its parameters changes a row; of one without parameters it is assumed."""
+def _changes_rows(instrument: Instrument) -> tuple[bool, ...]:
+    """For every effect, whether one of its parameters changes a row; of one without parameters it is assumed.
+
+    All moving elements are in the beam for that, as they are in some exposure or other.
+    """
     names = [leaf.name.partition(".")[0] for leaf in leaves(instrument)]
+    plan = jax.eval_shape(lambda shapes: blank_plan(shapes, needs(shapes).conditions), instrument)
     reached = {names[i] for i in np.flatnonzero(optical_reach(instrument, plan).any(axis=0))}
     return tuple(effect.name in reached or effect.name not in names for effect in instrument.effects)
 
