@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scenes import PLAN
 
-from walop_jax.diagnosis import exact
+from walop_jax.diagnosis import exact, refits
 from walop_jax.diagnosis.exact import other_descriptions
 from walop_jax.diagnosis.findings import Choice, document
+from walop_jax.diagnosis.hypotheses import Hypotheses
+from walop_jax.diagnosis.search import Reason, Round, State
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import FitResult, fit
@@ -86,6 +88,28 @@ def test_a_change_that_gained_nothing_is_not_compared_again(south, monkeypatch):
     earlier |= {TURNED: Choice(TURNED, 2.0, 30.0), REVERSED: Choice(REVERSED, 0.5)}
     other_descriptions(*asked, earlier=earlier)
     assert told == ["comparing 2 other descriptions"]
+
+
+@pytest.mark.parametrize(("evidence", "tried"), [(-40.0, []), (12.0, ["chwp_in_beam"])])
+def test_a_structural_effect_that_was_refuted_is_not_fitted_again(south, monkeypatch, evidence, tried):
+    """One that an earlier round left out for another reason is."""
+    fits = list[str]()
+    monkeypatch.setattr(refits, "try_effect", lambda _, effect: fits.append(effect.name) or Mock(exact.Trial))
+    monkeypatch.setattr(refits, "context_of", lambda result: PLAN.context())
+    monkeypatch.setattr(refits, "other_descriptions", lambda *_, **__: ([], {}))
+    plate = effect_by_name("chwp_in_beam")
+    reason = Reason(plate.name, evidence, 0.0, fitted=True, reason="something else was added first")
+    result = Mock(model=Mock(effect_names=()))
+    state = State(Mock(poor=True, result=result), rounds=(Round(0.0, "ghost", (reason,)),))
+    judge = refits.Refits(
+        hypotheses=Hypotheses(effects=(plate,)),
+        rng=np.random.default_rng(0),
+        tell=print,
+        minutes=np.inf,
+        began=0.0,
+    )
+    judge.others(state)
+    assert fits == tried
 
 
 def test_it_is_an_effect_like_any_other_once_it_is_in_a_model(south):

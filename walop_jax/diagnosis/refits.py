@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
@@ -117,15 +118,19 @@ class Refits:
         """Trials of other descriptions of the instrument, and all that were compared.
 
         Where the fit is poor (`Evidence.poor`) all descriptions are compared, and structural effects are tried as well;
-        else other curves of dispersion alone.
+        else other curves of dispersion alone. A structural effect that an earlier round refuted is not tried again: the
+        names that joined the model since then explain a part of the misfit, and leave less for the effect to explain.
         """
         result, trials = state.evidence.result, list[Trial]()
+        asked = itertools.chain(*(earlier.asked for earlier in state.rounds))
+        refuted = {reason.name for reason in asked if reason.fitted and reason.evidence <= 0.0}
 
         def allowed(further: int = 0) -> bool:
             return not self.over(state.fits + len(trials) + further)
 
         for effect in self.hypotheses.effects if state.evidence.poor else ():
-            if effect.is_structural() and effect.name not in result.model.effect_names and allowed():
+            known = effect.name in refuted or effect.name in result.model.effect_names
+            if effect.is_structural() and not known and allowed():
                 self.tell(f"trying {effect.name}")
                 trials.append(try_effect(result, effect.neutral(context_of(result))))
         described, compared = other_descriptions(
