@@ -18,7 +18,7 @@ def diagnosed(name: str, **values):
 
 
 def test_values_of_all_standards_are_one_cause():
-    """What is found is what was hidden, to the errors of the fit and the 2e-4 that the catalogue states of its values."""
+    """What is found is what was hidden, to the errors of the fit and the 2e-4 of the catalogue."""
     rng = np.random.default_rng(2)
     q, u = 0.004 * rng.standard_normal((2, 5))
     found = diagnosed("standard_values", q=q, u=u)

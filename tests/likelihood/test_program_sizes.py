@@ -54,10 +54,10 @@ def test_programs_of_a_fit_stay_small(likelihood):
     """Residuals; their derivatives are two programs, of the optics and of all that is behind them."""
     instrument, plan = likelihood.model.instrument(likelihood.model.start), likelihood.plan
     batch = next(iter(likelihood.points))
-    known = engine.solved_optics(instrument, plan, batch)
+    known = engine.optics_of_points(instrument, plan, batch)
     programs = {
         1300: (engine.residuals, (instrument, plan, batch)),
-        1900: (optics._solved, (instrument, plan, batch.x, batch.y)),
+        1900: (optics._known_optics, (instrument, plan, batch.x, batch.y)),
         1100: (engine._linearised_residuals, (instrument, plan, batch, known)),
     }
     for most, (program, args) in programs.items():

@@ -25,7 +25,7 @@ from walop_jax.fit.verdict import Structure
 from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import accurate_table, details_of, in_batches
-from walop_jax.likelihood.optics import Solved, directions, linearised, plain_positions, through_series
+from walop_jax.likelihood.optics import KnownOptics, directions, linearised, plain_positions, through_series
 from walop_jax.model import light
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array, compiled, usual_threads
@@ -153,7 +153,7 @@ def _vectors_at(
 
 
 def _slopes_at(
-    instrument: Instrument, plan: Plan, known: Solved, x: Float[Array, " p"], y: Float[Array, " p"]
+    instrument: Instrument, plan: Plan, known: KnownOptics, x: Float[Array, " p"], y: Float[Array, " p"]
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
     """Analysis vectors (p, b, k, 3) for light from the sky, and their derivatives (p, d, b, k, 3), from known optics.
 
@@ -161,7 +161,9 @@ def _slopes_at(
     """
     to_instrument, index = with_values(instrument), jnp.asarray(directions(instrument, plan).index)
 
-    def one(known: Solved, x: Scalar, y: Scalar) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
+    def one(
+        known: KnownOptics, x: Scalar, y: Scalar
+    ) -> tuple[Float[Array, "b k 3"], Float[Array, "d b k 3"]]:
         def vectors(values: Float[Array, " n"], local: Float[Array, " k"]) -> Float[Array, "b k 3"]:
             changed, rows = to_instrument(values), optics.with_slopes(values, *known, index)
             seen = light.camera_vectors(changed, rows, local, x, y) @ light.telescope(changed, x, y)
@@ -180,10 +182,10 @@ _seen_slopes = compiled(_slopes_at, optimised_above=limits.OPTIMISED_ABOVE, kept
 def _slopes(
     instrument: Instrument, plan: Plan, *columns: OfPoints
 ) -> tuple[Float[Array, "p b k 3"], Float[Array, "p d b k 3"]]:
-    """Analysis vectors and derivatives as of `_slopes_at`; `columns` as of `optics.solved`."""
+    """Analysis vectors and derivatives as of `_slopes_at`; `columns` as of `optics.known_optics`."""
     x, y, *numbers = map(array, columns)
     of_maps = dataclasses.replace(plan, work=limits.MAP_PLACES)
-    return _seen_slopes(instrument, plan, optics.solved(instrument, of_maps, x, y, *numbers), x, y)
+    return _seen_slopes(instrument, plan, optics.known_optics(instrument, of_maps, x, y, *numbers), x, y)
 
 
 def analysis_vectors(

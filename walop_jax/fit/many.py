@@ -51,7 +51,7 @@ from walop_jax.likelihood.likelihood import (
     OpticsUsed,
     UsedData,
 )
-from walop_jax.likelihood.optics import Solved
+from walop_jax.likelihood.optics import KnownOptics
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import with_values
@@ -249,7 +249,7 @@ def _approached(
 ) -> Float[np.ndarray, "s n"]:
     """The starts after some steps with the derivatives of the optics at the start of the first set."""
     template, plan, data = stack.first
-    held = engine.solved_optics(with_values(template)(array(starts[0])), plan, data)._replace(rows=None)
+    held = engine.optics_of_points(with_values(template)(array(starts[0])), plan, data)._replace(rows=None)
     precision, mean = np.zeros(starts.shape), np.zeros(starts.shape)
     for n, one in enumerate(likelihoods):
         rows = one.priors
@@ -444,7 +444,7 @@ def _side_by_side() -> int | None:
 
 def _steps_of_many(
     stack: Stack,
-    held: Solved,
+    held: KnownOptics,
     select: Float[Array, "n f"],
     values: Float[Array, "s n"],
     precision: Float[Array, "s n"],

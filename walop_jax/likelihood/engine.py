@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from walop_jax.likelihood import limits, optics
 from walop_jax.likelihood.field_table import FieldTable
 from walop_jax.likelihood.flux import FluxGroups, eliminate_flux, project_flux
-from walop_jax.likelihood.optics import LocalDerivatives, Solved, linearised, plain_positions, to_all
+from walop_jax.likelihood.optics import KnownOptics, LocalDerivatives, linearised, plain_positions, to_all
 from walop_jax.model import light
 from walop_jax.model.compiled import array, compiled
 from walop_jax.model.instrument import Instrument
@@ -38,7 +38,7 @@ from walop_jax.model.sources import PointIllumination
 from walop_jax.model.specification import series_indices
 
 Flux = Float[Array, "e f"]
-Nodes = FieldTable | Solved | None
+Nodes = FieldTable | KnownOptics | None
 NEWTON_STEPS = 3  # each squares the fraction of the detectors' distortion that is missing from the flux
 
 
@@ -95,7 +95,7 @@ def rows_at(
     sites = field_sites(template, point)
     if nodes is None:
         return jax.vmap(optics.band_rows, (None, None, None, 0, 0))(values, template, plan, *sites)
-    rows, slopes = nodes if isinstance(nodes, Solved) else nodes(*sites)
+    rows, slopes = nodes if isinstance(nodes, KnownOptics) else nodes(*sites)
     if rows is None:
         there = with_values(template)(jax.lax.stop_gradient(values))
         rows = jax.vmap(light.band_rows, (None, None, 0, 0))(there, plan, *sites)
@@ -103,12 +103,12 @@ def rows_at(
     return optics.with_slopes(values, rows, jnp.swapaxes(slopes, 0, 1), index)
 
 
-def solved_optics(instrument: Instrument, plan: Plan, data: PointData) -> Solved:
+def optics_of_points(instrument: Instrument, plan: Plan, data: PointData) -> KnownOptics:
     """Band rows and their derivatives at the sites of all points, one point after the other (p m)."""
     x, y = data.x, data.y
     if light.has_ghosts(instrument):
         x, y = (array(np.stack([at, -np.asarray(at)], axis=1).ravel()) for at in (x, y))
-    return optics.solved(instrument, plan, x, y)
+    return optics.known_optics(instrument, plan, x, y)
 
 
 def _by_point(known: Any, data: PointData) -> Any:
@@ -314,7 +314,7 @@ def block_equations(
 ) -> NormalEquations:
     """The normal equations of some points, each in its local quantities first: far fewer products than of all columns.
 
-    `Solved` optics are those of all sites (`solved_optics`).
+    `KnownOptics` optics are those of all sites (`optics_of_points`).
     """
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
@@ -325,7 +325,7 @@ def block_equations(
         r, jacobian, _ = _point_jacobian(instrument, plan, point, nodes)
         return r @ r, jacobian @ r, jacobian @ jacobian.T
 
-    each, nodes = (0, _by_point(nodes, data)) if isinstance(nodes, Solved) else (None, nodes)
+    each, nodes = (0, _by_point(nodes, data)) if isinstance(nodes, KnownOptics) else (None, nodes)
     chi2, gradient, gram = jax.vmap(of_point, (0, each))(data, nodes)
     k = plain.size
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
@@ -360,9 +360,9 @@ class Linearised(NamedTuple):
 
 
 def residuals_and_slopes(
-    instrument: Instrument, plan: Plan, data: PointData, known: Solved | None = None
+    instrument: Instrument, plan: Plan, data: PointData, known: KnownOptics | None = None
 ) -> Linearised:
-    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all sites (`solved_optics`)."""
+    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all sites (`optics_of_points`)."""
     each, known = (None, None) if known is None else (0, _by_point(known, data))
     residual, local, flux = jax.vmap(_point_jacobian, (None, None, 0, each))(instrument, plan, data, known)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))
@@ -372,8 +372,8 @@ def residuals_and_slopes(
 
 
 def linearised_residuals(instrument: Instrument, plan: Plan, data: PointData) -> Linearised:
-    """`residuals_and_slopes` by two programs: of the optics (`optics.solved`), and of all that is behind them."""
-    return _linearised_residuals(instrument, plan, data, solved_optics(instrument, plan, data))
+    """`residuals_and_slopes` by two programs: of the optics (`optics.known_optics`), and of all that is behind them."""
+    return _linearised_residuals(instrument, plan, data, optics_of_points(instrument, plan, data))
 
 
 def _incoming(instrument: Instrument, plan: Plan, point: PointData) -> Float[Array, "e 4"]:

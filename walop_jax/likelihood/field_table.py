@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 
 from walop_jax.io.shapes import OfPoints
 from walop_jax.likelihood import limits
-from walop_jax.likelihood.optics import solved
+from walop_jax.likelihood.optics import known_optics
 from walop_jax.model import chebyshev
 from walop_jax.model.chebyshev import Rectangle
 from walop_jax.model.compiled import array
@@ -157,7 +157,7 @@ TOLERANCE = 2e-10
 
 def solved_optics(instrument: Instrument, plan: Plan, x: OfPoints, y: OfPoints) -> Optics:
     """Band rows and their derivatives at field positions (deg): exact."""
-    return tuple(in_batches(lambda x, y: solved(instrument, plan, array(x), array(y)), x, y))
+    return tuple(in_batches(lambda x, y: known_optics(instrument, plan, array(x), array(y)), x, y))
 
 
 def in_batches(

@@ -14,7 +14,7 @@ The terms of one change that grow with different patterns p_k of the field, such
 point by their sum Σ a_k p_k(X, Y) alone: one direction, along p_k / Σ p_k², gives the slope s in that sum, and
 ∂R/∂a_k = p_k s.
 
-Rows and slopes come from programs of their own (`solved`): the largest part of what has to be compiled for a model, and
+Rows and slopes come from programs of their own (`known_optics`): the largest part of what has to be compiled for a model, and
 the same for all models that differ in effects on sources, on the polariser or on cameras alone.
 
 Units       parameters in their units; field coordinates deg.
@@ -194,7 +194,7 @@ def rows_and_slopes(
     return rows, slopes[along.colour] * shares[:, None, :, None]
 
 
-class Solved(NamedTuple):
+class KnownOptics(NamedTuple):
     """Band rows of field points, and their derivatives in the parameters of `directions`; `rows` None: not known.
 
     Slopes without rows are held as they are while the rows remain exact: these take a tenth of the time without
@@ -205,23 +205,25 @@ class Solved(NamedTuple):
     slopes: Float[Any, "*p o b r 4"]
 
 
-def _solved_at(instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]) -> Solved:
-    def one(x: Scalar, y: Scalar, *numbers: Scalar) -> Solved:
-        return Solved(*rows_and_slopes(instrument, with_numbers(plan, *numbers) if numbers else plan, x, y))
+def _optics_at(instrument: Instrument, plan: Plan, *columns: Float[Array, " p"]) -> KnownOptics:
+    def one(x: Scalar, y: Scalar, *numbers: Scalar) -> KnownOptics:
+        return KnownOptics(
+            *rows_and_slopes(instrument, with_numbers(plan, *numbers) if numbers else plan, x, y)
+        )
 
     return jax.vmap(one)(*columns)
 
 
-_solved = compiled(_solved_at, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="optics")
+_known_optics = compiled(_optics_at, optimised_above=limits.OFTEN_OPTIMISED_ABOVE, kept_as="optics")
 
 
-def solved(instrument: Instrument, plan: Plan, *columns: Float[Any, " p"]) -> Solved:
+def known_optics(instrument: Instrument, plan: Plan, *columns: Float[Any, " p"]) -> KnownOptics:
     """Band rows and their exact derivatives (`rows_and_slopes`) at field points, by a program of their own.
 
     `columns` are x and y (deg) and, if they are not those of the plan, colour temperature (K, 0: flat), temperature and
     hour angle.
     """
-    return _solved(*_of_optics(instrument, plan), *columns)
+    return _known_optics(*_of_optics(instrument, plan), *columns)
 
 
 def _of_optics(instrument: Instrument, plan: Plan) -> tuple[Instrument, Plan]:
