@@ -362,7 +362,7 @@ class Linearised(NamedTuple):
 def residuals_and_slopes(
     instrument: Instrument, plan: Plan, data: PointData, known: KnownOptics | None = None
 ) -> Linearised:
-    """All residuals, their derivatives, and the best fluxes; `known` are the optics of all sites (`optics_of_points`)."""
+    """All residuals, their derivatives, and the best fluxes; `known` are those of `optics_of_points`."""
     each, known = (None, None) if known is None else (0, _by_point(known, data))
     residual, local, flux = jax.vmap(_point_jacobian, (None, None, 0, each))(instrument, plan, data, known)
     basis = instrument.throughput.basis(*jax.vmap(field_sites, (None, 0))(instrument, data))

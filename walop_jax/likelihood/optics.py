@@ -14,8 +14,8 @@ The terms of one change that grow with different patterns p_k of the field, such
 point by their sum Σ a_k p_k(X, Y) alone: one direction, along p_k / Σ p_k², gives the slope s in that sum, and
 ∂R/∂a_k = p_k s.
 
-Rows and slopes come from programs of their own (`known_optics`): the largest part of what has to be compiled for a model, and
-the same for all models that differ in effects on sources, on the polariser or on cameras alone.
+Rows and slopes come from programs of their own (`known_optics`). They are the largest part of what has to be compiled
+for a model, and serve all models that differ in effects on sources, on the polariser or on cameras alone.
 
 Units       parameters in their units; field coordinates deg.
 Limits      all but parameters (field position, wavelengths, other arrays of the instrument) is differentiated
