@@ -242,7 +242,8 @@ def _emptied(leaf: Any) -> np.ndarray:
 def _changes_rows(instrument: Instrument) -> tuple[bool, ...]:
     """For every effect, whether one of its parameters changes a row; of one without parameters it is assumed.
 
-    All moving elements are in the beam for that, as they are in some exposure or other.
+    An effect does nothing at neutral: where no parameter reaches the rows, they are those without it. All moving
+    elements are in the beam for that, as they are in some exposure or other.
     """
     names = [leaf.name.partition(".")[0] for leaf in leaves(instrument)]
     plan = jax.eval_shape(lambda shapes: blank_plan(shapes, needs(shapes).conditions), instrument)
