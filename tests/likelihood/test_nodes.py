@@ -144,7 +144,7 @@ def test_what_cannot_be_interpolated_is_solved_point_by_point(simulated, exact, 
     likelihood = Likelihood.of(simulated.calset, base_model(simulated.calset), interpolate=True)
     values = likelihood.model.start
     found = likelihood.expand(values)
-    assert found.data == exact.expand(values).data
+    assert found.data == pytest.approx(exact.expand(values).data, rel=1e-14)  # other points together
     assert found.optics.nodes_per_side is None
     # Having failed there, nobody tries again nearby.
     monkeypatch.setattr("walop_jax.likelihood.likelihood.accurate_nodes", None)
