@@ -314,7 +314,7 @@ def block_equations(
 ) -> NormalEquations:
     """The normal equations of some points, each in its local quantities first: far fewer products than of all columns.
 
-    `KnownOptics` optics are those of all sites (`optics_of_points`).
+    `nodes` that are `KnownOptics` hold the sites of all points, one after the other (`optics_of_points`).
     """
     size, series, plain = values_of(instrument).size, series_indices(instrument), plain_positions(instrument)
 
