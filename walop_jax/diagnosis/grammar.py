@@ -39,7 +39,7 @@ from walop_jax.diagnosis.hypotheses import (
 from walop_jax.likelihood import limits
 from walop_jax.model.effects import Context, Described, EffectKind
 from walop_jax.model.effects.cameras import POWERS
-from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY, Change
+from walop_jax.model.effects.change import AMPLITUDES, BAND, KINDS, OPPOSITE, SKY, Change, place_of_star
 from walop_jax.model.effects.etalon import probed_gaps
 from walop_jax.model.effects.factors import FIELD
 from walop_jax.model.effects.in_models import effect_context
@@ -245,7 +245,7 @@ def _subjects(instrument: Instrument, exposures: Exposures, *, over_field: bool)
     for kinds in (OF_QU, ("polarisation",)) if exposures.direct("moon").any() else ():
         yield Subject.of(_base(kinds, "of", SKY))
     for name in instrument.standard.names:
-        yield Subject.of(_base(OF_QU, "of", name.replace(" ", "_")))
+        yield Subject.of(_base(OF_QU, "of", place_of_star(name)))
 
 
 def places_of(instrument: Instrument, exposures: Exposures) -> Iterator[list[tuple[str, str]]]:

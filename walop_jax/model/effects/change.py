@@ -333,6 +333,11 @@ def _pattern() -> re.Pattern[str]:
     )
 
 
+def place_of_star(name: str) -> str:
+    """The name of a star as the place of a change, which is one word."""
+    return name.replace(" ", "_")
+
+
 def patched(instrument: Instrument, terms: Iterable[Term]) -> Instrument:
     """The instrument with changes of some amplitudes; joint changes at one place are combined."""
     together: dict[tuple[Any, Hashable], list[Term]] = {}

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from walop_jax.model.alternatives import alternatives, changed
 from walop_jax.model.conventions import EXTINCTION
 from walop_jax.model.effects.base import Context, Effect, Scalar, numbered_camera
-from walop_jax.model.effects.change import Change, patched
+from walop_jax.model.effects.change import Change, patched, place_of_star
 from walop_jax.model.elements.wave_plate import WavePlate
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import Parameter, as_number, unknown_name
@@ -32,14 +32,9 @@ EVERY: Mapping[str, Callable[[Instrument], Sequence[str]]] = {
     "camera": lambda instrument: instrument.cameras.names,
     "analyser": lambda instrument: [f"{arm.name}.{arm.path[-1]}" for arm in instrument.arms],
     "wave_plate": lambda instrument: instrument.places(WavePlate),
-    "standard": lambda instrument: list(map(_one_word, instrument.standard.names)),
+    "standard": lambda instrument: list(map(place_of_star, instrument.standard.names)),
 }
 """Places of `every`."""
-
-
-def _one_word(name: str) -> str:
-    """The name of a star as changes and labels have it."""
-    return name.replace(" ", "_")
 
 
 class Member(NamedTuple):
@@ -135,7 +130,7 @@ class Entry:
         labels = {
             "camera": [f"n{k}" for k in range(len(context.cameras))],
             "moon exposure": list(map(str, context.moon_ids)),
-            "standard": list(map(_one_word, context.sources)),
+            "standard": list(map(place_of_star, context.sources)),
         }
         values = {
             member.name: as_number(
@@ -322,7 +317,7 @@ class Named(Effect):
         if "camera" in chosen:
             names = instrument.cameras.names
             chosen["camera"] = names[numbered_camera(self.name, chosen["camera"], names)]
-        text = text.format_map({name: _one_word(str(value)) for name, value in chosen.items()})
+        text = text.format_map({name: place_of_star(str(value)) for name, value in chosen.items()})
         expanded = list(_expanded(text, instrument))
         if member.each in EVERY:
             return [[item] for item in expanded]

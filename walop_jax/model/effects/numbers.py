@@ -22,6 +22,7 @@ from walop_jax.model.effects.change import (
     add,
     in_exposures,
     itself,
+    place_of_star,
 )
 from walop_jax.model.effects.factors import EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.elements.wave_plate import Grown, WavePlate
@@ -116,7 +117,7 @@ def _of_patch(instrument: Instrument, change: Change) -> Grows:
 
 
 def _of_star(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
-    names = [name.replace(" ", "_") for name in instrument.standard.names]
+    names = list(map(place_of_star, instrument.standard.names))
     for change, size in terms:
         axis = change.kind.removeprefix("polarisation").strip()
         if change.place not in names or not axis:
@@ -149,7 +150,7 @@ class GrownStandard(Component):
 
 def _slots_of_source(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """Slots of the light: q or u of a star, by the number of the star in the list."""
-    names = [name.replace(" ", "_") for name in instrument.standard.names]
+    names = list(map(place_of_star, instrument.standard.names))
     star = (names.index(change.place),) if change.place in names else ()
     place = instrument.standard.name if star else change.place
     return [SlotTerm(("light", change.kind, change.relation, place, *star), 1.0, change.factors)]
