@@ -83,6 +83,8 @@ EVERY_CHANGE = (
     "reported gain of O1 * hours",
     "light in E1 * hours",
     "light of E1 in O1",
+    "light of E2 in O2 * r2",
+    "light of O2 in E2 * hours * x",
     "light of opposite in O2",
     "afterglow in O1",
 )

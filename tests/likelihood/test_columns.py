@@ -43,9 +43,14 @@ SENTENCES = (
     "gain of O1 * counts",
     "gain of half2 * root counts * r2",
     "light of E1 in O1",
+    "light of O2 in E1 * x",
+    "light of E2 in O1 * hours * y",
     "light in O2 * hours",
+    "light in O1 * r2",
     "light of opposite in E2",
     "afterglow in O1",
+    "afterglow in E2 * y",
+    "reported gain of O2 * hours * x",
     "axis of half1.plate * hours",
     "axis of chwp * sin 2 CHWP",
     "thickness of chwp.mgf2 * hour angle",
@@ -138,6 +143,7 @@ def test_beside_an_active_effect(laid, name):
     values = np.array([start.get(p.name, p.start) for p in likelihood.model.parameters])
     texts = ["gain of half1 * ring 3", "retardance q behind collimator * x", "gain of E1 * exposure 3"]
     texts += ["light of E1 in O1", "gain of O1 * counts", "polarisation of sky"]
+    texts += ["light of O2 in E1 * r2", "light of E2 in O2 * hours * x"]
     ours = columns(likelihood, values, [_said(text) for text in texts])
     theirs = own_columns(likelihood, values, [Described.saying([text], [0.0]) for text in texts])
     _alike(ours, theirs, texts)

@@ -486,13 +486,15 @@ class ResponseBlock:
                 change = change * (self.value == star)[:, None, :, None]
             raw = np.einsum("pmeks,pmes->pmek", vectors, change) * responses.light.factor
             return self._pairs(raw) * self.share * self.flux
-        stage, cameras = slot
+        stage, cameras, *origin = slot
         if stage == "counts":
             return self._pairs(responses.counts * cameras) * self.share * self.flux
         if stage == "opposite":
             return self._alone(responses.opposite * cameras) * self.flux
         shape = responses.electrons.shape
         added = np.broadcast_to(self.of.median, shape) if stage == "median" else responses.added[stage]
+        if origin:  # counts of one camera in others
+            added = added[..., origin]
         return self._alone(added * cameras) * (self.weight if self.linear else 1.0)
 
     def _alone(self, values: Float[np.ndarray, "p e k"]) -> Float[np.ndarray, "m k n"]:

@@ -31,7 +31,6 @@ from jaxtyping import Array, Float
 
 from walop_jax.model import fold, light
 from walop_jax.model.compiled import derivatives
-from walop_jax.model.effects.cameras import CrossTalk
 from walop_jax.model.effects.change import BAND, SKY, Change, patched
 from walop_jax.model.effects.numbers import OF_POLARISER, OF_QU, OF_SOURCES
 from walop_jax.model.effects.optics import ADDED, DISPLACEMENTS, GENERATORS, generator, with_air_gap
@@ -218,9 +217,8 @@ def _vectors(
 ) -> light.Vectors:
     """Analysis vectors with fractions of every camera in every other."""
     beams = light.beams(instrument, light.in_bands(instrument, rows, mean))
-    pairs = tuple(np.ndindex(len(throughput), len(throughput)))
     vectors = light.behind_throughput(instrument, beams, throughput, *at)
-    return CrossTalk(tuple(shares), pairs).vectors(vectors, *at)
+    return vectors + jnp.einsum("ko,bos->bks", shares.reshape(len(throughput), -1), vectors)
 
 
 def _banded(plan: Plan, at: FieldPoint, moved: Moved, sizes: tuple[int, int], gaps: Gaps) -> _Banded:

@@ -71,11 +71,12 @@ IN_VAIN = (
     ("rotator of sky", "hours"),
     ("polarisation of sky", "x"),
     ("fringes of half1.plate * gap 10", "hours"),
-    ("light of E1 in O1", "x"),
+    ("light of E1 in O1", "counts"),
+    ("light of opposite in O1", "x"),
     ("light of opposite in O1", "hours"),
-    ("light in O1", "x"),
+    ("light in O1", "colour"),
     ("afterglow in O1", "counts"),
-    ("reported gain of O1", "x"),
+    ("reported gain of O1", "counts"),
 )
 
 
@@ -280,9 +281,21 @@ def test_an_elliptical_retarder_is_the_exponential_of_its_generator(vector):
         assert np.asarray(slopes[..., i]) == pytest.approx(expected, abs=1e-14)
 
 
+def test_light_of_another_camera_that_differs_over_the_field_and_between_exposures():
+    """N_O1 → N_O1 + a f N_E1 by hand, f = X/h for a steady fraction, and X/h times the hours for one that grows."""
+    bare, hours = scenes.observe(), scenes.EXPOSURES.mjd - scenes.EXPOSURES.mjd.min()
+    of_field = np.asarray(scenes.X)[:, None] / 0.3
+    for factors, expected in (("x", of_field), ("hours * x", of_field * 24.0 * hours)):
+        counts = scenes.observe(said(f"light of E1 in O1 * {factors}", values=[0.02]))
+        np.testing.assert_allclose(counts[..., 0], bare[..., 0] + 0.02 * expected * bare[..., 1], rtol=1e-12)
+        np.testing.assert_array_equal(counts[..., 1:], bare[..., 1:])
+
+
 def test_what_cannot_be_carried_over_is_said():
     assert left_behind(scenes.instrument(said("gain of O1 * hours", values=[0.0]))) == ("described",)
     assert left_behind(scenes.instrument(said("afterglow in O1", values=[0.0]))) == ("described",)
+    assert left_behind(scenes.instrument(said("light of E1 in O1 * r2", values=[0.0]))) == ()
+    assert left_behind(scenes.instrument(said("light of E1 in O1 * hours", values=[0.0]))) == ("described",)
     assert left_behind(scenes.instrument(said("retardance q behind collimator * r2", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("gain of half1 * ring 4", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("gain of half1 * root counts * x", values=[0.0]))) == ()

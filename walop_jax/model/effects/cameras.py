@@ -5,6 +5,8 @@ Equation    N_k → N_k + a f g_k, with g_k
             reported gain  N_k as reported, behind all other changes of the detector
             light          N_j of another camera; of no origin: the median counts of the exposure; of opposite: N_k at
                            (−X, −Y), extended sources only
+                           A fraction of another camera that is the same in all exposures is part of the analysis
+                           vectors, which stars see; one that differs between them acts where counts are reported
             afterglow      N_k of the preceding exposure
 Symbols     a amplitude, f product of the factors; the place is a camera, or an arm for both of its cameras
 """
@@ -41,6 +43,7 @@ from walop_jax.model.effects.change import (
     SlotTerm,
     Term,
     in_exposures,
+    with_factors,
 )
 from walop_jax.model.effects.factors import COUNTS, EXPOSURE, FIELD, WAVELENGTH
 from walop_jax.model.instrument import Instrument
@@ -89,16 +92,18 @@ class GainOfExposures(_Cameras, ExposurePart):
 
 
 class CrossTalk(Mixing):
-    """Fractions of the light of cameras in other ones."""
+    """Fractions of the light of cameras in other ones, the same in all exposures."""
 
     amplitudes: tuple[Scalar, ...]
+    changes: tuple[Change, ...] = eqx.field(static=True)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # (target, origin)
 
     def vectors(self, vectors: Float[Array, "b k 4"], x: Scalar, y: Scalar) -> Float[Array, "b k 4"]:
         """The analysis vectors (b, k, 4) with the light of other cameras added."""
         targets, origins = (np.array(column) for column in zip(*self.pairs, strict=True))
-        shares = jnp.stack(self.amplitudes)[:, None]
-        return vectors.at[:, targets].add(shares * vectors[:, origins])
+        shares = with_factors(zip(self.changes, self.amplitudes, strict=True), AtPoint(x, y))
+        sizes = jnp.stack([jnp.asarray(share, float) for _, share in shares])
+        return vectors.at[:, targets].add(sizes[:, None] * vectors[:, origins])
 
 
 class Ghost(GhostPart):
@@ -136,41 +141,48 @@ POWERS = {"root counts": "root", "counts": "square", "counts squared": "cube"}
 
 
 class OfDetectors(_Cameras, DetectorPart):
-    """Additions to arriving counts, of one stage of `ADDED`."""
+    """Additions to arriving counts, of one stage of `ADDED`; `origins` are the cameras whose counts are added, None
+    where those of a camera are added to itself.
+    """
 
     stage: str = eqx.field(static=True, default="reported")
+    origins: tuple[int | None, ...] = eqx.field(static=True, kw_only=True)
 
     def reported(
         self, counts: Float[Array, "e k"], exposures: ExposureArrays, x: FieldCoordinate, y: FieldCoordinate
     ) -> Float[Array, "e k"]:
         """The counts (e, k) with the additions of this stage."""
         added, total = ADDED[self.stage](counts, exposures), counts
-        for change, size in zip(self.changes, self.sizes, strict=True):
+        for change, origin, size in zip(self.changes, self.origins, self.sizes, strict=True):
             of_exposures = any(factor.depends_on == EXPOSURE for factor in change.grows_with)
             pattern = in_exposures(change, exposures, x, y) if of_exposures else change.factor(AtPoint(x, y))
-            total = total + size * added * jnp.asarray(pattern, float)[..., None]
+            light = added if origin is None else added[:, origin, None]
+            total = total + size * light * jnp.asarray(pattern, float)[..., None]
         return total
 
 
 def stage_of(change: Change) -> str:
     """The stage at which a change acts: a key of `ADDED`, "throughput", "counts", "mixed" or "opposite"."""
+    still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     if change.kind == "light":
-        return "opposite" if change.origin == OPPOSITE else "mixed" if change.origin else "median"
+        of_camera = "mixed" if still else "reported"
+        return {"": "median", OPPOSITE: "opposite"}.get(change.origin, of_camera)
     if change.kind != "gain":
         return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
     if powers := [factor.text for factor in change.grows_with if factor.depends_on == COUNTS]:
         if len(powers) > 1:
             raise ValueError(f"{change.text!r}: a gain grows with one of {', '.join(POWERS)}")
         return POWERS[powers[0]]
-    still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     return "throughput" if still else "counts"
 
 
 def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     """The instrument with changes that act at one stage."""
     stage = stage_of(terms[0][0])
+    origins = tuple(_origin(instrument, change) for change, _ in terms)
     if stage in ADDED:
-        return instrument.with_part("detectors", OfDetectors.of(instrument, terms, stage=stage))
+        detectors = OfDetectors.of(instrument, terms, stage=stage, origins=origins)
+        return instrument.with_part("detectors", detectors)
     if stage == "throughput":
         return instrument.with_part("transmission", Shade.of(instrument, terms))
     if stage == "counts":
@@ -178,19 +190,20 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
     if stage == "opposite":
         shares = [size * np.array(cameras_of(instrument, change.place)) for change, size in terms]
         return instrument.with_part("ghosts", Ghost(jnp.sum(jnp.stack(shares), axis=0)))
-    targets, origins = (
-        [cameras_of(instrument, place).index(1.0) for place in places]
-        for places in zip(*((change.place, change.origin) for change, _ in terms), strict=True)
-    )
+    changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
+    targets = (cameras_of(instrument, change.place).index(1.0) for change in changes)
     pairs = tuple(zip(targets, origins, strict=True))
-    return instrument.with_part("mixing", CrossTalk(tuple(size for _, size in terms), pairs))
+    return instrument.with_part("mixing", CrossTalk(amplitudes, changes, pairs))
+
+
+def _origin(instrument: Instrument, change: Change) -> int | None:
+    """Number of the camera whose light a change adds; None for light of no single camera."""
+    return cameras_of(instrument, change.origin).index(1.0) if change.origin not in ("", OPPOSITE) else None
 
 
 _WITH: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(POWERS.values(), (COUNTS, FIELD, EXPOSURE)),
-    "reported": (EXPOSURE,),
-    "median": (EXPOSURE,),
-    "afterglow": (EXPOSURE,),
+    **dict.fromkeys(("reported", "median", "afterglow", "mixed"), (FIELD, EXPOSURE)),
     "throughput": (FIELD,),
     "counts": (FIELD, EXPOSURE),
 }
@@ -213,23 +226,40 @@ _ARM = (
     Combinations(("rings",)),
     Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
 )
-_LIGHT = Combinations(along=("steady", *SLOW, *SINGLE, "kind")), Combinations(among=("all",))
+_LIGHT = (
+    Combinations(along=("steady", *SLOW, *SINGLE, "kind")),
+    Combinations(("smooth",), ("steady",)),
+    Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
+    Combinations(among=("all",)),
+)
+_LIGHT_OF_CAMERA = (
+    *_LIGHT,
+    Combinations(along=("side", "night", "step")),
+    Combinations(("tilt",), ("side",)),
+)
 
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
-    stage = stage_of(change)
-    tried = _LIGHT if stage == "median" else (Combinations(among=("alone", "all")),)
+    stage, tried = stage_of(change), (Combinations(among=("alone", "all")),)
     if change.kind == "gain":
         tried = _CAMERA if change.place in instrument.cameras.names else _ARM
+    elif change.kind == "light" and change.origin != OPPOSITE:
+        tried = _LIGHT_OF_CAMERA if change.origin else _LIGHT
     return Grows(_WITH.get(stage, ()), None, tried)
 
 
 def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
-    """A stage and the cameras; for analysis vectors a slot for each camera, or target and origin."""
-    stage, cameras = stage_of(change), cameras_of(instrument, change.place)
-    slots: list[tuple[Any, ...]] = [(stage, cameras)]
+    """A stage and the cameras, and the camera whose light it is; for analysis vectors a slot for each camera, or target
+    and origin.
+    """
+    stage, cameras, origin = (
+        stage_of(change),
+        cameras_of(instrument, change.place),
+        _origin(instrument, change),
+    )
+    slots: list[tuple[Any, ...]] = [(stage, cameras) if origin is None else (stage, cameras, origin)]
     if stage == "mixed":
-        slots = [(stage, cameras.index(1.0), cameras_of(instrument, change.origin).index(1.0))]
+        slots = [(stage, cameras.index(1.0), origin)]
     elif stage == "throughput":
         slots = [(stage, camera) for camera, share in enumerate(cameras) if share]
     return [SlotTerm(slot, 1.0, change.factors) for slot in slots]
