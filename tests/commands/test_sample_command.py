@@ -77,7 +77,7 @@ def test_sample_says_what_is_wrong(call, fitted: FittedSet, calset_file: Path, t
     assert refused.exit_code == 1
     assert "another model" in refused.stderr
     assert "walks" in call("sample", run, "--moves", "walks").stderr
-    assert "choose one of emcee, nuts, or give" in call("sample", run, "--sampler", "walk").stderr
+    assert "choose one of emcee, nuts, bootstrap, or give" in call("sample", run, "--sampler", "walk").stderr
     assert "no option" in call("sample", run, "--sampler", OWN, "--moves", "de").stderr
     assert not (run / "sampling").exists()
 

@@ -128,8 +128,10 @@ def test_every_effect_against_the_whole_light_path(laid):
     assert len(first) >= 30
     for effect, probe in first.items():
         changes = [change for member in probe.group for change in member.first_order(template)]
-        ours = columns(likelihood, values, changes)
-        _alike(ours, own_columns(likelihood, values, probe.group), [effect.name] * ours.shape[1])
+        ours, theirs = columns(likelihood, values, changes), own_columns(likelihood, values, probe.group)
+        shown = theirs.any(axis=0)  # of all standards some were not observed
+        assert not ours[:, ~shown].any()
+        _alike(ours[:, shown], theirs[:, shown], [effect.name] * int(shown.sum()))
 
 
 @pytest.mark.parametrize("name", quick(BESIDE, []))

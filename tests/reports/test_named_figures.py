@@ -129,7 +129,7 @@ def test_figures_of_a_diagnosis(tmp_path):
         assert draw(name, run).axes[0].has_data()
         assert_fits_in_print(draw(name, dataclasses.replace(run, canvas=Canvas(width=89.0 / 25.4))), 89.0)
     rows = [axis.get_ylabel().splitlines()[:-2] for axis in draw("effect", run).axes[:12:4]]
-    assert rows == [["without", "clp_wobble"], ["clp_wobble"], ["with", "clp_wobble"]]
+    assert rows == [["without", "clp_wobble"], ["explained by", "clp_wobble"], ["with", "clp_wobble"]]
     whole = draw("effect", dataclasses.replace(run, step=0))
     assert whole.axes[0].get_ylabel().splitlines()[:2] == ["starting", "model"]
     for step in (2, -1):

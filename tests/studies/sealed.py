@@ -10,7 +10,7 @@ line with the sentences of a diagnosis (kinds, places and factors are other ones
     optics       M → exp(a g f s A) M, to second order, at a place of the train: ahead of the polariser, in it and
                  turning with it, behind it, behind the collimator, ahead of the analyser of one half
     detectors    counts of a camera or a half × (1 + a g f), or × (1 + a g (N/N₀)^γ), or + a share of the light of
-                 another place of the same camera
+                 another camera
     sky          polarisation added to the Moon sky, or to standards, by a law of time, angle or star
 
 A is a random sum of the six generators of the Poincaré sphere and of unequal depolarisations; f a random smooth pattern

@@ -161,7 +161,7 @@ def _base(kinds: Iterable[str], where: str, place: str, origin: str = "") -> Bas
 def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterator[Base]:
     """All groups of descriptions: the changes of each subject, with each pattern over the field and each law."""
     for bases, patterns, _, group, order in _with_laws(instrument, exposures, points):
-        for pattern, base in itertools.product(patterns, bases):
+        for pattern, base in itertools.product(filter(PATTERNS.get, patterns), bases):
             pairs = [
                 tuple(filter(None, pair[::order])) for pair in itertools.product(group, PATTERNS[pattern])
             ]
@@ -344,8 +344,10 @@ PATTERNS: Mapping[str, tuple[str, ...]] = {
     "focus": ("", "r2"),
     "smooth": ("", "x", "y", "r2"),
     "rings": tuple(f"ring {degree}" for degree in thresholds.RINGS),
+    "any": (),
 }
-"""Patterns over the field (`Combinations.over`): factors that have an amplitude each."""
+"""Patterns over the field (`Combinations.over`): factors that have an amplitude each; "any" is a smooth field alone
+(`smooth_fields`)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,7 +37,7 @@ from walop_jax.model.instrument import Instrument
 from walop_jax.model.noise import Noise
 from walop_jax.model.parameters import values_of
 from walop_jax.model.plan import Plan, with_median
-from walop_jax.model.planning import outgrown, plan_for
+from walop_jax.model.planning import outgrown, plan_for, waves_followed
 from walop_jax.model.specification import Model
 from walop_jax.sky.moon import SkyOfExposures
 
@@ -50,10 +50,12 @@ class Layout:
 
     There are `points` field points, `batch` in a batch (one call of the engine). `interpolated` says whether the optics
     are to be solved on nodes over `rectangle` (deg) and interpolated, `large` whether a fit should do with as few
-    passes as can be, `mirrored` whether the optics of the opposite points are needed too, for ghosts.
+    passes as can be, `mirrored` whether the optics of the opposite points are needed too, for ghosts. `followed` are
+    the waves of fringes that its wavelength nodes follow in each band of the set.
     """
 
     plan: Plan
+    followed: tuple[tuple[float, float], ...]
     points: int
     batch: int
     interpolated: bool
@@ -91,6 +93,7 @@ class Layout:
         batch = min(batch or usual, points)
         return cls(
             plan=plan,
+            followed=waves_followed(planned, curves_of(calset)),
             points=points,
             batch=batch,
             interpolated=interpolated,
@@ -119,8 +122,8 @@ def planned_instrument(calset: CalibrationSet, model: Model) -> Instrument:
     """
     if np.array_equal(values_of(model.template), model.start):
         return model.template
-    start = model.instrument()
-    return model.template if outgrown(start, model.template, curves_of(calset)) else start
+    start, curves = model.instrument(), curves_of(calset)
+    return model.template if outgrown(waves_followed(start, curves), model.template, curves) else start
 
 
 def curves_of(calset: CalibrationSet) -> list[FilterCurve]:

@@ -25,7 +25,6 @@ from walop_jax.likelihood.layout import (
     PointReader,
     curves_of,
     fields_of_stars,
-    planned_instrument,
 )
 from walop_jax.likelihood.noise import log_variance, noise_expansion, variance_ratio
 from walop_jax.likelihood.optics import directions
@@ -256,7 +255,7 @@ class Likelihood(ShortDir):
         It returns itself if its nodes follow them already.
         """
         instrument = self.model.instrument(values)
-        if not outgrown(planned_instrument(self.calset, self.model), instrument, curves_of(self.calset)):
+        if not outgrown(self.layout.followed, instrument, curves_of(self.calset)):
             return self
         model, layout = dataclasses.replace(self.model, template=instrument), self.layout
         how = {"interpolate": layout.interpolated, "sets": layout.sets}

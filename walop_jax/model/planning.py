@@ -197,13 +197,23 @@ def _rule(wavelength: tuple[float, ...], throughput: tuple[float, ...], *fringes
     )
 
 
-def outgrown(planned: Instrument, instrument: Instrument, curves: Iterable[FilterCurve]) -> bool:
-    """True where retarders are too thick for the nodes of a plan for `planned` in any of the bands."""
-    old, new = planned.patched(), instrument.patched()
+def waves_followed(planned: Instrument, curves: Iterable[FilterCurve]) -> tuple[tuple[float, float], ...]:
+    """Waves of fringes that the nodes of a plan for `planned` follow in each of the bands: those of full strength, and
+    those of all layers of a plate.
+    """
+    patched = planned.patched()
+    return tuple(_fringes(patched, curve) for curve in curves)
+
+
+def outgrown(
+    followed: Iterable[tuple[float, float]], instrument: Instrument, curves: Iterable[FilterCurve]
+) -> bool:
+    """True where retarders have more fringes in any of the bands than the nodes of a plan follow (`waves_followed`)."""
+    patched = instrument.patched()
     return any(
-        waves > followed
-        for curve in curves
-        for waves, followed in zip(_fringes(new, curve, 1.0), _fringes(old, curve), strict=True)
+        waves > most
+        for curve, limits in zip(curves, followed, strict=True)
+        for waves, most in zip(_fringes(patched, curve, 1.0), limits, strict=True)
     )
 
 

@@ -191,8 +191,8 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
         shares = [size * np.array(cameras_of(instrument, change.place)) for change, size in terms]
         return instrument.with_part("ghosts", Ghost(jnp.sum(jnp.stack(shares), axis=0)))
     changes, amplitudes = (tuple(column) for column in zip(*terms, strict=True))
-    targets = (cameras_of(instrument, change.place).index(1.0) for change in changes)
-    pairs = tuple(zip(targets, origins, strict=True))
+    targets = [cameras_of(instrument, change.place).index(1.0) for change in changes]
+    pairs = tuple((k, origin) for k, origin in zip(targets, origins, strict=True) if origin is not None)
     return instrument.with_part("mixing", CrossTalk(amplitudes, changes, pairs))
 
 
@@ -227,15 +227,8 @@ _ARM = (
     Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
 )
 _LIGHT = (
-    Combinations(along=("steady", *SLOW, *SINGLE, "kind")),
-    Combinations(("smooth",), ("steady",)),
-    Combinations(("tilt",), (*SLOW, *SINGLE, "kind")),
+    Combinations(("even", "any"), ("steady", *SLOW, *SINGLE, "kind")),
     Combinations(among=("all",)),
-)
-_LIGHT_OF_CAMERA = (
-    *_LIGHT,
-    Combinations(along=("side", "night", "step")),
-    Combinations(("tilt",), ("side",)),
 )
 
 
@@ -244,7 +237,7 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     if change.kind == "gain":
         tried = _CAMERA if change.place in instrument.cameras.names else _ARM
     elif change.kind == "light" and change.origin != OPPOSITE:
-        tried = _LIGHT_OF_CAMERA if change.origin else _LIGHT
+        tried = _LIGHT
     return Grows(_WITH.get(stage, ()), None, tried)
 
 
