@@ -310,6 +310,10 @@ class Examination(Evidence):
             self.design, fields, context, bases, {n: names for n, names in also.items() if names}
         )
 
+    def forget(self) -> None:
+        """Give back the memory of the smooth fields, which are laid out anew where they are asked for again."""
+        vars(self).pop("smooth", None)
+
     def _of_single_exposures(self) -> AnyMatrix:
         """Columns Z of which Z Zᵀ is what the disturbances of single exposures take up, behind the free parameters."""
         if SINGLE_EXPOSURES not in self.candidates:

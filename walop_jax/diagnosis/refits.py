@@ -79,6 +79,7 @@ class Refits:
         self, state: State, result: FitResult, steps: Sequence[Trial], earlier: Examination | None = None
     ) -> State:
         """The state with another fit of its set, and with the additions that this has."""
+        state.evidence.forget()
         evidence = self.examined(result, earlier or state.evidence)
         return dataclasses.replace(state, evidence=evidence, steps=tuple(steps))
 

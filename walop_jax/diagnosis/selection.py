@@ -103,6 +103,11 @@ def most_probable(evidence: Evidence) -> MissingThings:
     return JointScores(evidence).posterior()
 
 
+TOGETHER = (
+    1_000_000  # products of columns of candidates of one size that are worked on at once: 8 MB of each array
+)
+
+
 class JointScores:
     """All candidates of one fit, ready to be scored beside any few of them.
 
@@ -142,7 +147,8 @@ class JointScores:
         self._blocks = [
             (chosen, *self._block(chosen, int(size), grams))
             for size in np.unique(sizes)
-            for chosen in [np.flatnonzero(sizes == size)]
+            for alike in [np.flatnonzero(sizes == size)]
+            for chosen in np.array_split(alike, -(-len(alike) * int(size) ** 2 // TOGETHER))
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
         effects = {name for name, probe in self.probes.items() if probe.effect is not Described}

@@ -1,6 +1,6 @@
 """Scores of changes that vary over the field in any smooth way: one candidate for each place and law.
 
-A smooth field f(X, Y) is a Gaussian process, expanded in Legendre polynomials to the sixth degree, which become less
+A smooth field f(X, Y) is a Gaussian process, expanded in Legendre polynomials to the eighth degree, which become less
 probable with their degree (`model.effects.factors.smooth_deviations`). Its columns are not written out: the column of a
 term is that of the same change without a pattern, times the values of the term at the field points.
 
@@ -77,9 +77,8 @@ class SmoothFields:
     def widths(self) -> AnyVector:
         """Prior widths of all amplitudes, one candidate after the other; those that data cannot show have 0."""
         widths = np.concatenate([self.widths_of(name) for name in self.names])
-        before, after = (
-            np.concatenate([np.diag(square) for square in squares]) for squares in (self._before, self.grams)
-        )
+        after = np.concatenate([np.diag(gram) for gram in self.grams])
+        before = np.concatenate(self._squares)
         shown = (after > ABSORBED * before) & (np.sqrt(np.clip(after, 0.0, None)) * widths > FAINTEST)
         return np.where(shown, widths, 0.0)
 
@@ -93,27 +92,15 @@ class SmoothFields:
         """CᵀPr of all amplitudes."""
         return self.products(self.behind(self.design.residual[:, None]))[:, 0]
 
-    @cached_property
+    @property
     def grams(self) -> list[AnyMatrix]:
         """The Gram matrix of each candidate, behind the free parameters and the disturbances of single exposures."""
-        taken = [self.products(basis) for basis in self.bases]
-        return [
-            square - sum((along[at] @ along[at].T for along in taken), np.zeros_like(square))
-            for square, at in zip(self._before, self.places.values(), strict=True)
-        ]
+        return self._grams_and_squares[0]
 
     def products(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "a n"]:
         """CᵀV of all amplitudes with any columns V, of which only the rows of data count."""
-        sums = np.zeros((self._terms.shape[1], len(self._place), rows.shape[1]))
-        for point, at in enumerate(self._rows_of_points):
-            sums += self._terms[point][:, None, None] * (self._columns[at].T @ rows[at])
-        count, columns = len(sums), rows.shape[1]
-        return np.concatenate(
-            [
-                sums[:, of].swapaxes(0, 1).reshape(count * len(field.changes), columns)
-                for of, field in zip(self._of, self.fields, strict=True)
-            ]
-        )
+        sums = self._sums(rows)
+        return np.concatenate([self._of_field(sums, number) for number in range(len(self.fields))])
 
     def columns(self, name: str) -> AnyMatrix:
         """The columns of one candidate, rows of data in units of the noise."""
@@ -140,7 +127,7 @@ class SmoothFields:
         """
         number = self._number[name]
         scores, gram = self.scores[self.places[name]], self.grams[number]
-        probe, free, before = self.probe(name), self.design.projector.free, np.diag(self._before[number])
+        probe, free, before = self.probe(name), self.design.projector.free, self._squares[number]
         space = ScoreSpace((name,), (self.sizes[number],), probe.widths, before, gram, free)
         score = space.table_after(ScoreTable((), noise, 1.0, 1.0), scores)[name]
         information, pull = gram / noise**2, scores / noise**2
@@ -186,16 +173,39 @@ class SmoothFields:
         ).tolist()
         return [slice(first, stop) for first, stop in zip([0, *ends], ends, strict=False)]
 
+    def _sums(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "f c n"]:
+        """Σ_p F_pf c_pᵀ V_p of all terms f and distinct changes c."""
+        sums = np.zeros((self._terms.shape[1], len(self._place), rows.shape[1]))
+        for point, at in enumerate(self._rows_of_points):
+            sums += self._terms[point][:, None, None] * (self._columns[at].T @ rows[at])
+        return sums
+
+    def _of_field(self, sums: Float[np.ndarray, "f c n"], number: int) -> Float[np.ndarray, "a n"]:
+        """The sums of one candidate: its changes one after the other, of each all terms."""
+        of_changes = sums[:, self._of[number]].swapaxes(0, 1)
+        return of_changes.reshape(-1, sums.shape[2])
+
+    @property
+    def _squares(self) -> list[AnyVector]:
+        """Squares of the columns of each candidate, ahead of any projection."""
+        return self._grams_and_squares[1]
+
     @cached_property
-    def _before(self) -> list[AnyMatrix]:
-        """Products of the columns of each candidate with one another, ahead of any projection."""
-        terms, grams = self._terms, list[AnyMatrix]()
-        for places in self._of:
+    def _grams_and_squares(self) -> tuple[list[AnyMatrix], list[AnyVector]]:
+        """The Gram matrices behind the bases, and their diagonals ahead of any projection."""
+        terms, grams, squares = self._terms, list[AnyMatrix](), list[AnyVector]()
+        of_pairs = np.einsum("pf,pg->pfg", terms, terms).reshape(len(terms), -1)
+        taken = [self._sums(basis) for basis in self.bases]
+        for number, places in enumerate(self._of):
             own = np.ascontiguousarray(self._columns[:, places], float)
-            squares = np.stack([own[at].T @ own[at] for at in self._rows_of_points])
-            of_pairs = np.einsum("pf,pg->pfg", terms, terms).reshape(len(terms), -1)
-            gram = (squares.reshape(len(terms), -1).T @ of_pairs).reshape(
-                *squares.shape[1:], *(terms.shape[1],) * 2
+            of_points = np.stack([own[at].T @ own[at] for at in self._rows_of_points])
+            gram = (of_points.reshape(len(terms), -1).T @ of_pairs).reshape(
+                *of_points.shape[1:], *(terms.shape[1],) * 2
             )
-            grams.append(gram.transpose(0, 2, 1, 3).reshape(len(places) * terms.shape[1], -1))
-        return grams
+            gram = gram.transpose(0, 2, 1, 3).reshape(len(places) * terms.shape[1], -1)
+            squares.append(np.diag(gram).copy())
+            for sums in taken:
+                along = self._of_field(sums, number)
+                gram -= along @ along.T
+            grams.append(gram)
+        return grams, squares

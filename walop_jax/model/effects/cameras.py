@@ -220,6 +220,7 @@ _CAMERA = (
     Combinations(("tilt", "focus"), SLOW),
     Combinations(("tilt",), (*SINGLE, "kind", "side"), ("alone", "arm")),
     Combinations(("smooth",), (*SLOW, *SINGLE, "kind", "side"), ("alone", "arm")),
+    Combinations(("any",), among=("alone", "arm")),  # finer than the throughput of the model
 )
 _ARM = (
     Combinations(along=(*SLOW, *SINGLE, "side", "night", "step", "kind")),

@@ -94,7 +94,7 @@ def _side(at: Any, _: Units, prefix: str) -> Any:
     return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
 
 
-SMOOTH_DEGREE = 6
+SMOOTH_DEGREE = 8
 """Largest total degree of the terms of a smooth field."""
 SMOOTH_LENGTH = 0.5
 """Length over which a smooth field changes, in units of the scale of the field."""
@@ -102,7 +102,7 @@ SMOOTH_LENGTH = 0.5
 
 @functools.cache
 def smooth_deviations() -> tuple[float, ...]:
-    """Standard deviations of the coefficients of P_0 … P_6 along one axis of a Gaussian process of variance 1.
+    """Standard deviations of the coefficients of P_0 … P_8 along one axis of a Gaussian process of variance 1.
 
     Equation    s_i² = ((2i + 1)/2)² ∫∫ P_i(t) P_i(u) exp(−(t − u)²/2ℓ²) dt du, t and u from −1 to 1
     Symbols     ℓ `SMOOTH_LENGTH`; the process over the field has the kernel exp(−|Δ|²/2ℓ²), so that the term i, j has
