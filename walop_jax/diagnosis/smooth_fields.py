@@ -183,7 +183,7 @@ class SmoothFields:
     def _of_field(self, sums: Float[np.ndarray, "f c n"], number: int) -> Float[np.ndarray, "a n"]:
         """The sums of one candidate: its changes one after the other, of each all terms."""
         of_changes = sums[:, self._of[number]].swapaxes(0, 1)
-        return of_changes.reshape(-1, sums.shape[2])
+        return of_changes.reshape(self.sizes[number], sums.shape[2])
 
     @property
     def _squares(self) -> list[AnyVector]:
