@@ -144,11 +144,15 @@ class JointScores:
         self.log_prior = np.zeros(len(self.names))
         for members in kinds.values():
             self.log_prior[members] = -np.log(len(kinds)) - np.log(len(members))
+        self._shown = np.array([np.count_nonzero(self.widths[place]) for place in self._places])
         self._blocks = [
-            (chosen, *self._block(chosen, int(size), grams))
+            (chosen, *self._block(chosen, grams))
             for size in np.unique(sizes)
             for alike in [np.flatnonzero(sizes == size)]
-            for chosen in np.array_split(alike, -(-len(alike) * int(size) ** 2 // TOGETHER))
+            for chosen in np.array_split(
+                alike[np.argsort(self._shown[alike], kind="stable")],
+                -(-len(alike) * int(size) ** 2 // TOGETHER),
+            )
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)
         effects = {name for name, probe in self.probes.items() if probe.effect is not Described}
@@ -159,11 +163,17 @@ class JointScores:
         self._known: dict[tuple[frozenset[SetMember], bytes], Float[np.ndarray, "n t"]] = {}
 
     def _block(
-        self, chosen: Int[np.ndarray, " n"], size: int, grams: Sequence[AnyMatrix]
+        self, chosen: Int[np.ndarray, " n"], grams: Sequence[AnyMatrix]
     ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n k k"]]:
-        """Positions of the amplitudes of candidates of one size, and products of the columns of each."""
-        at = np.array([self._places[number].start for number in chosen])[:, None] + np.arange(size)
-        gram = np.stack([grams[number] for number in chosen])
+        """Positions of the amplitudes of candidates of one size, and products of the columns of each.
+
+        Amplitudes that the data cannot show have no influence. They are left out, but for as many as it takes to have
+        the same number of all these candidates.
+        """
+        size = max(1, self._shown[chosen].max())
+        inside = [np.argsort(self.widths[self._places[n]] == 0.0, kind="stable")[:size] for n in chosen]
+        at = np.array([self._places[n].start + own for n, own in zip(chosen, inside, strict=True)])
+        gram = np.stack([grams[n][np.ix_(own, own)] for n, own in zip(chosen, inside, strict=True)])
         return at, gram * self.widths[at][:, :, None] * self.widths[at][:, None, :] / self._noise**2
 
     def _products_with(self, number: int) -> Float[np.ndarray, "a k"]:
@@ -209,7 +219,7 @@ class JointScores:
                 np.empty((len(chosen), size + 1, size + 1)),
                 (slice(None), slice(size), slice(size)),
             )
-            for column, t in enumerate(SCALES[: 1 if size == 1 else None]):
+            for column, t in enumerate(SCALES[: self.scales_of[chosen].max(initial=0)]):
                 whole[inside] = np.eye(size) + t**2 * left
                 whole[:, size, :size] = whole[:, :size, size] = t * s
                 whole[:, size, size] = 1.0 + t**2 * np.sum(s**2, axis=1)
