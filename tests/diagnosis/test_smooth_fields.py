@@ -25,11 +25,13 @@ from walop_jax.likelihood.likelihood import Likelihood
 from walop_jax.model import legendre
 from walop_jax.model.effects import Context, Described
 from walop_jax.model.effects.change import Change
-from walop_jax.model.effects.factors import SMOOTH_DEGREE, SMOOTH_LENGTH, smooth_deviations
+from walop_jax.model.effects.factors import SMOOTH_LENGTH, smooth_deviations
 from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.instrument import nominal_instrument
 from walop_jax.simulation.observing_plan import ObservingPlan, polariser_turn
 from walop_jax.simulation.simulate import simulate
+
+OF_OPTICS, OF_CAMERAS = 6, 8  # largest degrees of the terms of a smooth field
 
 
 def test_the_prior_is_that_of_coefficients_of_a_gaussian_process():
@@ -44,14 +46,14 @@ def test_the_prior_is_that_of_coefficients_of_a_gaussian_process():
         polynomial = np.polynomial.legendre.Legendre.basis(degree)(nodes)
         coefficients = (degree + 0.5) * (weights * polynomial) @ draws
         assert np.std(coefficients) == pytest.approx(sigma, rel=0.02)
-    # What the degrees to six hold of the variance of the process: nearly all.
+    # What the degrees to eight hold of the variance of the process: nearly all.
     held = sum(s**2 / (2 * i + 1) for i, s in enumerate(smooth_deviations()))
     assert 0.99 < held < 1.0
 
 
 def test_the_size_of_a_smooth_field_is_its_rms_over_the_square():
     """Mean square of Σ a f over a fine grid of the field, against the sum of the squares of a × rms of each term."""
-    terms = legendre.terms(SMOOTH_DEGREE)
+    terms = legendre.terms(OF_CAMERAS)
     changes = [Change.parsed(f"gain of O1 * field {i} {j}") for i, j in terms]
     amplitudes = np.random.default_rng(2).standard_normal(len(terms))
     edges = np.linspace(-0.3, 0.3, 400)
@@ -95,14 +97,22 @@ def test_every_smooth_field_can_be_said_of_its_instrument(name):
     context = Context()
     for field in fields:
         probe = field.probe(context)
-        assert len(probe.widths) == len(field.changes) * len(legendre.terms(SMOOTH_DEGREE))
-        for text in texts_of(probe)[:: len(legendre.terms(SMOOTH_DEGREE)) - 1]:
+        assert len(probe.widths) == len(field.changes) * len(field.terms)
+        for text in texts_of(probe)[:: len(field.terms) - 1]:
             Change.parsed(text).check_factors(instrument)
             assert Change.parsed(text).candidate in field.name
-    camera = instrument.cameras.names[0]
-    laws = {change.beside_field for field in fields for change in field.changes if change.place == camera}
-    assert {("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= laws
+    reference, camera, *_ = instrument.cameras.names
+    changes = [change for field in fields for change in field.changes if change.place == camera]
+    for origins in ([""], [reference]):  # diffuse light, and light of another camera
+        light = {c.beside_field for c in changes if c.kind == "light" and c.origin in origins}
+        assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= light
+    assert any(change.kind == "afterglow" for change in changes)
+    laws = {change.beside_field for change in changes if change.kind == "gain"}
+    assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= laws
     assert any(len(law) == 1 and law[0].startswith("hours 4.5 to ") for law in laws)
+    # Where a pair has a flux of its own, or none is known, a steady gain of one camera is one of the other.
+    steady = {field.name for field in fields if {c.text for c in field.changes} == {f"gain of {reference}"}}
+    assert bool(steady) == (name != "WALOP-NORTH")
     assert not smooth_fields(instrument, exposures, 4)  # too few points for a pattern
 
 
@@ -141,16 +151,21 @@ def made_up(rng, length=1.0):
     )
     made = vars(design.measured)["columns"] = object.__new__(Columns)
     vars(made)["rounded"] = lambda changes, exact: (None, columns)
-    changes = [Change.parsed(text) for text in ("gain of O1 * hours", "turn of polariser", "gain of E2")]
+    changes = [
+        Change.parsed(text) for text in ("gain of O1 * hours", "turn of polariser", "axis of half1.plate")
+    ]
     fields = [SmoothField((changes[0],), False), SmoothField(tuple(changes[1:]), False)]
     smooth = SmoothFields(design, fields, Context(), (basis[:, :4], 0.5 * basis[:, 4:]))
     value = [
         np.polynomial.legendre.Legendre.basis(i)(x / 0.3) * np.polynomial.legendre.Legendre.basis(j)(y / 0.3)
-        for i, j in legendre.terms(SMOOTH_DEGREE)
+        for i, j in legendre.terms(OF_CAMERAS)
     ]
-    sigma = [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(SMOOTH_DEGREE)]
+    sigma = [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(OF_CAMERAS)]
     terms = (np.array(value).T * sigma)[point]
-    written = np.hstack([columns[:, k, None].astype(float) / 2.0 * terms for k in range(3)])
+    counts = len(legendre.terms(OF_CAMERAS)), *[len(legendre.terms(OF_OPTICS))] * 2
+    written = np.hstack(
+        [columns[:, k, None].astype(float) / 2.0 * terms[:, :n] for k, n in enumerate(counts)]
+    )
     written = np.vstack([written, np.zeros((priors, written.shape[1]))])
     both = np.hstack(smooth.bases)
     return smooth, written, written - both @ (both.T @ written)
@@ -159,8 +174,8 @@ def made_up(rng, length=1.0):
 def test_products_of_random_columns_are_those_of_columns_written_out():
     """Gram matrices, scores and products with other columns, term by term, by plain matrix algebra."""
     smooth, written, behind = made_up(np.random.default_rng(4))
-    count = len(legendre.terms(SMOOTH_DEGREE))
-    for gram, at in zip(smooth.grams, (slice(count), slice(count, 3 * count)), strict=True):
+    count = len(legendre.terms(OF_CAMERAS))
+    for gram, at in zip(smooth.grams, (slice(count), slice(count, None)), strict=True):
         # A disturbance with a prior takes up a part: CᵀC − (CᵀB)(CᵀB)ᵀ.
         assert np.allclose(gram, written[:, at].T @ behind[:, at], atol=1e-5)
     assert np.allclose(smooth.scores, behind.T @ smooth.design.residual, atol=1e-5)
@@ -174,7 +189,7 @@ def test_products_of_random_columns_are_those_of_columns_written_out():
 def test_a_smooth_field_is_fitted_with_the_most_probable_scale_of_its_prior():
     """Scale and amplitudes against densities of the residuals, and ridge regression, on columns written out."""
     smooth, written, behind = made_up(np.random.default_rng(5), 2000.0)
-    name, count, noise = smooth.names[0], len(legendre.terms(SMOOTH_DEGREE)), 0.7
+    name, count, noise = smooth.names[0], len(legendre.terms(OF_CAMERAS)), 0.7
     item = smooth.ranked(name, noise)
     c, residual, widths = written[:, :count], smooth.design.residual, item.probe.widths
     information, pull = c.T @ behind[:, :count] / noise**2, behind[:, :count].T @ residual / noise**2
@@ -194,6 +209,11 @@ PLACES = (
     "depolarisation of polariser * kelvin * smooth",
     "diattenuation v ahead of polariser * smooth * kind moon",
     "gain of O1 * counts * smooth",
+    "gain of E1 * smooth",
+    "light of E1 in O1 * smooth",
+    "light of O2 in E1 * hours * smooth",
+    "light in E2 * smooth",
+    "afterglow in O2 * smooth",
 )
 
 
@@ -307,7 +327,7 @@ def test_a_field_of_plane_waves_is_told_with_its_place_and_law():
     expected = 4e-3 * np.sqrt(np.mean(np.cos(waves @ _square()).sum(axis=0) ** 2))
     assert abs(shown[0] - expected) < 5.0 * shown[1]
     names = list(entry["terms"])
-    assert len(names) == len(legendre.terms(SMOOTH_DEGREE))
+    assert len(names) == len(legendre.terms(OF_CAMERAS))
     at = [found.after.model.index(f"described.{Change.parsed(text).label}") for text in names]
     degrees = [tuple(map(int, text.rpartition("field ")[2].split())) for text in names]
     sigma = smooth_deviations()

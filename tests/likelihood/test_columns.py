@@ -55,6 +55,7 @@ SENTENCES = (
     "axis of chwp * sin 2 CHWP",
     "thickness of chwp.mgf2 * hour angle",
 )
+LIGHT = ("light of O2 in E1 * x", "light of E2 in O1 * hours * y")
 BESIDE = {
     "camera_leakage": {"share": 2e-3},
     "ghost": {"share": 3e-3},
@@ -90,7 +91,7 @@ def _alike(ours: np.ndarray, theirs: np.ndarray, names: list[str], within: float
     assert np.max(off) < within, dict(zip(names, off, strict=True))
 
 
-@pytest.mark.parametrize("text", quick(SENTENCES, [SENTENCES[n] for n in (1, 7, 9, 20, -2)]))
+@pytest.mark.parametrize("text", quick(SENTENCES, [*(SENTENCES[n] for n in (1, 7, 9, 20, -2)), *LIGHT]))
 def test_sentences_against_the_whole_light_path(laid, text):
     """The light path with the sentence in it, differentiated: nothing is the same but the physics of elements."""
     likelihood, values = laid
@@ -129,8 +130,9 @@ def test_every_effect_against_the_whole_light_path(laid):
     for effect, probe in first.items():
         changes = [change for member in probe.group for change in member.first_order(template)]
         ours, theirs = columns(likelihood, values, changes), own_columns(likelihood, values, probe.group)
-        shown = theirs.any(axis=0)  # of all standards some were not observed
-        assert not ours[:, ~shown].any()
+        shown = theirs.any(axis=0)
+        # Of the standards some were not observed.
+        assert shown.all() or (effect.name == "standard_values" and not ours[:, ~shown].any()), effect.name
         _alike(ours[:, shown], theirs[:, shown], [effect.name] * int(shown.sum()))
 
 
@@ -151,7 +153,7 @@ def test_beside_an_active_effect(laid, name):
     _alike(ours, theirs, texts)
 
 
-@pytest.mark.parametrize("text", quick(SENTENCES[:21:4], SENTENCES[4:5]))
+@pytest.mark.parametrize("text", quick((*SENTENCES[:21:4], *LIGHT), SENTENCES[4:5]))
 def test_sentences_against_finite_differences(laid, text):
     """Residuals of models that have a little of it, one way and the other."""
     likelihood, values = laid

@@ -288,13 +288,20 @@ class Examination(Evidence):
     def smooth(self) -> SmoothFields | None:
         """Smooth fields with their scores, made when they are first asked for; None of a set with too few points.
 
-        Where gradients over the field at two places are the same change (`synonyms`), smooth fields there are as well.
+        Where gradients over the field at two places are the same change (`synonyms`), smooth fields there are as well;
+        of changes that are not tried with a gradient those without a pattern tell.
         """
-        columns, by_gradient = self.design.columns, {field.gradient: field for field in self.fields}
+        columns = self.design.columns
+        by_description = {
+            field.gradient if field.gradient in self.candidates else field.even: field
+            for field in self.fields
+        }
         also = {
-            by_gradient[name].name: tuple(by_gradient[other].name for other in others if other in by_gradient)
+            by_description[name].name: tuple(
+                by_description[other].name for other in others if other in by_description
+            )
             for name, others in self.synonyms.items()
-            if name in by_gradient
+            if name in by_description
         }
         said = set(itertools.chain(*also.values()))
         fields = [

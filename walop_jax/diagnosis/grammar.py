@@ -171,10 +171,12 @@ def _groups(instrument: Instrument, exposures: Exposures, points: int) -> Iterat
 def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> tuple[SmoothField, ...]:
     """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with.
 
-    Changes that begin or end at some time are tried without a pattern, but for smooth fields.
+    Changes that begin or end at some time are tried without a pattern, but for smooth fields. Where the counts of two
+    cameras are known but for a common factor, a gain of one is a gain of the other, which is asked for alone.
     """
     found: dict[str, SmoothField] = {}
     bare = dataclasses.replace(instrument, effects=())
+    references = {instrument.cameras.names[k] for k in instrument.cameras.ratio_references}
     over_field = points >= FEWEST_POINTS
     for bases, patterns, form, group, order in _with_laws(bare, exposures, points, every_kind=True):
         allowed = KINDS[bases[0][0].kind].grows(bare, bases[0][0]).allowed if bases else ()
@@ -183,6 +185,8 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
             continue
         for base in bases:
             changes = [description.times(*filter(None, (law,))) for description in base for law in group]
+            if any(c.kind == "gain" and not c.factors and c.place in references for c in changes):
+                continue
             # All amplitudes of one kind come together, as `Described` has them.
             changes.sort(key=lambda change: list(AMPLITUDES).index(change.parameter))
             field = SmoothField(tuple(changes), pattern_first=order < 0)
@@ -304,8 +308,10 @@ def _of_cameras(
     orthogonal = {name: cameras[j] for name, j in zip(cameras, instrument.cameras.orthogonal, strict=True)}
     if two := [pair for pair in orthogonal.items() if pair[0] != pair[1]]:
         yield Subject.of(*(_base(("light",), "in", *pair) for pair in two))
-    for name, origin in itertools.permutations(cameras, 2):
-        if orthogonal[name] != origin:
+    together = instrument.cameras.together
+    for (k, name), (j, origin) in itertools.permutations(enumerate(cameras), 2):
+        # Between arms of unknown fluxes light would have to be counted in the flux of the arm that it comes from.
+        if orthogonal[name] != origin and (together is None or together[k, j]):
             yield Subject.of(_base(("light",), "in", name, origin))
 
 

@@ -26,7 +26,7 @@ from walop_jax.model.dependence import conditions_of_effect
 from walop_jax.model.effects import Context, Described, Effect, EffectKind
 from walop_jax.model.effects.catalogue import applies
 from walop_jax.model.effects.change import Change
-from walop_jax.model.effects.factors import SMOOTH_DEGREE
+from walop_jax.model.effects.factors import FINEST_DEGREE, SMOOTH_DEGREE
 from walop_jax.model.instrument import Instrument
 from walop_jax.model.parameters import leaves
 from walop_jax.model.ray import CONDITIONS
@@ -107,6 +107,16 @@ class SmoothField(NamedTuple):
         return "; ".join(dict.fromkeys(self._with(change, "field 0 0").candidate for change in self.changes))
 
     @property
+    def terms(self) -> Sequence[tuple[int, int]]:
+        """Degrees along X and Y of its terms: fewer of optics, of which a field of all nine kinds is one candidate."""
+        return legendre.terms(FINEST_DEGREE if self.changes[0].of_camera else SMOOTH_DEGREE)
+
+    @property
+    def even(self) -> str:
+        """The name of the description that has no pattern over the field."""
+        return "; ".join(change.text for change in self.changes)
+
+    @property
     def gradient(self) -> str:
         """The name of the description that has a gradient over the field in the place of the smooth field."""
         return "; ".join(self._with(change, along).text for change in self.changes for along in ("x", "y"))
@@ -117,8 +127,8 @@ class SmoothField(NamedTuple):
 
     def probe(self, context: Context) -> Probe:
         """The candidate, its amplitudes change by change, and term by term of each."""
-        terms = [f"field {i} {j}" for i, j in legendre.terms(SMOOTH_DEGREE)]
-        texts = tuple(self._with(change, term).text for change in self.changes for term in terms)
+        patterns = [f"field {i} {j}" for i, j in self.terms]
+        texts = tuple(self._with(change, pattern).text for change in self.changes for pattern in patterns)
         return Probe(self.name, Described, (Described.of(context, sentences=texts),), context)
 
 

@@ -112,6 +112,8 @@ def search(state: State, judge: TrialJudge) -> State:
             break
         if ended := judge.over(state.fits):
             return dataclasses.replace(state, ended=ended)
+        if sum(len(step.groups) for step in state.steps) > thresholds.MOST_SENTENCES:
+            break  # what so many descriptions are needed for is told as unexplained, whatever a further one would add
         trial, state = _next(state, judge)
         if trial is None:
             break

@@ -122,7 +122,7 @@ class JointScores:
         names, sizes, scores = list(space.names), np.array(space.sizes), np.asarray(evidence.scores)
         self.widths = np.where(space.alive, space.widths, 0.0)
         if smooth is not None:
-            # The descriptions of a smooth field, a hundred at a time, are made when it is fitted.
+            # The descriptions of a smooth field, which are 28 or more, are made when it is fitted.
             self.probes |= {name: Probe(name, Described, ()) for name in smooth.names}
             names, sizes = [*names, *smooth.names], np.concatenate([sizes, smooth.sizes])
             self.widths = np.concatenate([self.widths, smooth.widths])
@@ -151,7 +151,7 @@ class JointScores:
             for alike in [np.flatnonzero(sizes == size)]
             for chosen in np.array_split(
                 alike[np.argsort(self._shown[alike], kind="stable")],
-                -(-len(alike) * int(size) ** 2 // TOGETHER),
+                min(len(alike), -(-len(alike) * int(size) ** 2 // TOGETHER)),
             )
         ]
         self.scales_of = np.where(sizes > 1, len(SCALES), 1)

@@ -1,8 +1,9 @@
 """Scores of changes that vary over the field in any smooth way: one candidate for each place and law.
 
-A smooth field f(X, Y) is a Gaussian process, expanded in Legendre polynomials to the eighth degree, which become less
-probable with their degree (`model.effects.factors.smooth_deviations`). Its columns are not written out: the column of a
-term is that of the same change without a pattern, times the values of the term at the field points.
+A smooth field f(X, Y) is a Gaussian process, expanded in Legendre polynomials to the sixth degree, of cameras to the
+eighth. The terms become less probable with their degree (`model.effects.factors.smooth_deviations`). Columns are not
+written out: the column of a term is that of the same change without a pattern, times the values of the term at the
+field points.
 
 Equation    C_{cf} = c F_f,   C_{cf}ᵀ V = Σ_p F_pf (c_pᵀ V_p)
             and behind the free parameters and the disturbances of single exposures G = CᵀC − (CᵀB)(CᵀB)ᵀ, s = CᵀPr
@@ -29,7 +30,7 @@ from walop_jax.diagnosis.score import ABSORBED, FAINTEST, Candidate, ScoreSpace,
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.model import legendre
 from walop_jax.model.effects import Context
-from walop_jax.model.effects.factors import SMOOTH_DEGREE, smooth_deviations
+from walop_jax.model.effects.factors import FINEST_DEGREE, smooth_deviations
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class SmoothFields:
     @cached_property
     def sizes(self) -> tuple[int, ...]:
         """Number of amplitudes of each."""
-        return tuple(len(field.changes) * self._terms.shape[1] for field in self.fields)
+        return tuple(len(field.changes) * len(field.terms) for field in self.fields)
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -84,8 +85,8 @@ class SmoothFields:
 
     def widths_of(self, name: str) -> AnyVector:
         """Prior widths of the amplitudes of one candidate, whatever the data can show."""
-        changes, count = self.fields[self._number[name]].changes, self._terms.shape[1]
-        return np.repeat([change.width(self.context.largest) for change in changes], count)
+        field = self.fields[self._number[name]]
+        return np.repeat([change.width(self.context.largest) for change in field.changes], len(field.terms))
 
     @cached_property
     def scores(self) -> AnyVector:
@@ -104,8 +105,9 @@ class SmoothFields:
 
     def columns(self, name: str) -> AnyMatrix:
         """The columns of one candidate, rows of data in units of the noise."""
-        of_changes = self._columns[:, self._of[self._number[name]]].astype(float)
-        terms = self._terms[self.design.point]
+        number = self._number[name]
+        of_changes = self._columns[:, self._of[number]].astype(float)
+        terms = self._terms[self.design.point, : len(self.fields[number].terms)]
         return (of_changes[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
 
     def candidate(self, name: str) -> Candidate:
@@ -161,9 +163,9 @@ class SmoothFields:
         """Values of the terms of a smooth field at the field points, times their standard deviations."""
         points, units = self.design.fit.calset.points, self.design.fit.model.template.units
         sigma = np.array(
-            [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(SMOOTH_DEGREE)]
+            [smooth_deviations()[i] * smooth_deviations()[j] for i, j in legendre.terms(FINEST_DEGREE)]
         )
-        return np.asarray(legendre.basis(points.x, points.y, SMOOTH_DEGREE, units.field)) * sigma
+        return np.asarray(legendre.basis(points.x, points.y, FINEST_DEGREE, units.field)) * sigma
 
     @cached_property
     def _rows_of_points(self) -> list[slice]:
@@ -182,7 +184,7 @@ class SmoothFields:
 
     def _of_field(self, sums: Float[np.ndarray, "f c n"], number: int) -> Float[np.ndarray, "a n"]:
         """The sums of one candidate: its changes one after the other, of each all terms."""
-        of_changes = sums[:, self._of[number]].swapaxes(0, 1)
+        of_changes = sums[: len(self.fields[number].terms), self._of[number]].swapaxes(0, 1)
         return of_changes.reshape(self.sizes[number], sums.shape[2])
 
     @property
@@ -193,16 +195,18 @@ class SmoothFields:
     @cached_property
     def _grams_and_squares(self) -> tuple[list[AnyMatrix], list[AnyVector]]:
         """The Gram matrices behind the bases, and their diagonals ahead of any projection."""
-        terms, grams, squares = self._terms, list[AnyMatrix](), list[AnyVector]()
-        of_pairs = np.einsum("pf,pg->pfg", terms, terms).reshape(len(terms), -1)
+        grams, squares = list[AnyMatrix](), list[AnyVector]()
+        of_pairs = {
+            count: np.einsum("pf,pg->pfg", *[self._terms[:, :count]] * 2).reshape(len(self._terms), -1)
+            for count in {len(field.terms) for field in self.fields}
+        }
         taken = [self._sums(basis) for basis in self.bases]
-        for number, places in enumerate(self._of):
-            own = np.ascontiguousarray(self._columns[:, places], float)
+        for number, (field, places) in enumerate(zip(self.fields, self._of, strict=True)):
+            count, own = len(field.terms), np.ascontiguousarray(self._columns[:, places], float)
             of_points = np.stack([own[at].T @ own[at] for at in self._rows_of_points])
-            gram = (of_points.reshape(len(terms), -1).T @ of_pairs).reshape(
-                *of_points.shape[1:], *(terms.shape[1],) * 2
-            )
-            gram = gram.transpose(0, 2, 1, 3).reshape(len(places) * terms.shape[1], -1)
+            gram = of_points.reshape(len(of_points), -1).T @ of_pairs[count]
+            gram = gram.reshape(*of_points.shape[1:], count, count).transpose(0, 2, 1, 3)
+            gram = gram.reshape(len(places) * count, -1)
             squares.append(np.diag(gram).copy())
             for sums in taken:
                 along = self._of_field(sums, number)

@@ -10,7 +10,7 @@ Parameters that change no row in common are differentiated together: a plate in 
 the other half as they are (the colouring of a sparse Jacobian; Curtis, Powell & Reid 1974, J. Inst. Maths Applics 13,
 117). Which parameter reaches which rows is found by following it through the operations, not declared.
 
-The terms of one change that grow with different patterns p_k of the field, such as the 45 of a smooth field, enter at a
+The terms of one change that grow with different patterns p_k of the field, such as the 28 of a smooth field, enter at a
 point by their sum Σ a_k p_k(X, Y) alone: one direction, along p_k / Σ p_k², gives the slope s in that sum, and
 ∂R/∂a_k = p_k s.
 

@@ -359,7 +359,9 @@ def is_linear(instrument: LightPath) -> bool:
 def detected(
     instrument: LightPath, exposures: ExposureArrays, counts: Counts, x: Scalar, y: Scalar
 ) -> Counts:
-    """Counts (e, k) reported by the detectors for counts in electrons: the only stage not linear in the light."""
+    """Counts (e, k) reported by the detectors for counts in electrons: the only stage that may be not linear in the
+    light, or mix cameras in single exposures.
+    """
     for detector in instrument.patched().cameras.detectors:
         counts = detector.reported(counts, exposures, x, y)
     return counts

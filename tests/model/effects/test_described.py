@@ -17,7 +17,7 @@ from walop_jax.fit.model_file import model_without_data, render
 from walop_jax.model import light, mueller
 from walop_jax.model.compiled import compiled
 from walop_jax.model.conventions import OF_WALOP
-from walop_jax.model.dependence import left_behind
+from walop_jax.model.dependence import is_undone, left_behind
 from walop_jax.model.effects import Change, Described, effect_by_name
 from walop_jax.model.effects.change import AMPLITUDES, KINDS
 from walop_jax.model.effects.factors import PLAIN, factor
@@ -296,6 +296,11 @@ def test_what_cannot_be_carried_over_is_said():
     assert left_behind(scenes.instrument(said("afterglow in O1", values=[0.0]))) == ("described",)
     assert left_behind(scenes.instrument(said("light of E1 in O1 * r2", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("light of E1 in O1 * hours", values=[0.0]))) == ("described",)
+    both = said("reported gain of O1", "light of E2 in O2 * hours", values=[0.1, 0.1])
+    parts = scenes.instrument(both).patched().cameras.detectors
+    assert [is_undone(part, 4) for part in parts] == [True, False], (
+        "catalogues are corrected for the gain all the same"
+    )
     assert left_behind(scenes.instrument(said("retardance q behind collimator * r2", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("gain of half1 * ring 4", values=[0.0]))) == ()
     assert left_behind(scenes.instrument(said("gain of half1 * root counts * x", values=[0.0]))) == ()
@@ -317,6 +322,9 @@ def test_what_cannot_be_carried_over_is_said():
         ("polarisation of blue_star", "there is no description 'polarisation of blue_star'"),
         ("fringes of half1.plate", "state the gap"),
         ("shift of filter", "there is no place of shift 'filter'"),
+        ("light of E1 in half2", "one camera and another one"),
+        ("light of half1 in O2 * hours", "one camera and another one"),
+        ("light of E1 in E1", "one camera and another one"),
     ],
 )
 def test_what_is_no_sentence_is_an_error(text, message):

@@ -8,7 +8,11 @@ Equation    N_k → N_k + a f g_k, with g_k
                            A fraction of another camera that is the same in all exposures is part of the analysis
                            vectors, which stars see; one that differs between them acts where counts are reported
             afterglow      N_k of the preceding exposure
-Symbols     a amplitude, f product of the factors; the place is a camera, or an arm for both of its cameras
+Symbols     a amplitude, f product of the factors; the place is a camera, or, but for light of another camera, an arm
+            for both of its cameras
+Limits      Light of another camera is counted in the flux of the camera that it goes into while it is the same in all
+            exposures, and in the flux of the camera that it comes from otherwise. The two differ where arms have fluxes
+            of their own (`Cameras.split`).
 """
 
 from __future__ import annotations
@@ -197,8 +201,24 @@ def _patch(instrument: Instrument, terms: Sequence[Term]) -> Instrument:
 
 
 def _origin(instrument: Instrument, change: Change) -> int | None:
-    """Number of the camera whose light a change adds; None for light of no single camera."""
-    return cameras_of(instrument, change.origin).index(1.0) if change.origin not in ("", OPPOSITE) else None
+    """Number of the camera whose light a change adds; None for light of no single camera.
+
+    Raises ValueError where its light comes from several cameras, or from and to the same, or goes into several.
+    """
+    if change.origin in ("", OPPOSITE):
+        return None
+    weights, targets = (cameras_of(instrument, name) for name in (change.origin, change.place))
+    if sum(weights) != 1.0 or sum(targets) != 1.0 or weights == targets:
+        raise ValueError(f"{change.text!r}: give one camera and another one, as in 'light of E1 in O1'")
+    return weights.index(1.0)
+
+
+def _together(change: Change) -> tuple[str, bool]:
+    """Changes that act at one stage are patched together, those that are the same in all exposures by themselves.
+
+    Catalogues are corrected for these alone (`model.dependence`).
+    """
+    return stage_of(change), any(factor.depends_on == EXPOSURE for factor in change.grows_with)
 
 
 _WITH: Mapping[str, tuple[str, ...]] = {
@@ -235,7 +255,9 @@ _LIGHT = (
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
     stage, tried = stage_of(change), (Combinations(among=("alone", "all")),)
-    if change.kind == "gain":
+    if change.kind == "afterglow":
+        tried = (*tried, Combinations(("any",)))
+    elif change.kind == "gain":
         tried = _CAMERA if change.place in instrument.cameras.names else _ARM
     elif change.kind == "light" and change.origin != OPPOSITE:
         tried = _LIGHT
@@ -267,7 +289,7 @@ _TESTS = {
     "light": "the same field points at another flux, and darks",
 }
 KINDS |= {
-    name: ChangeKind("share", _patch, stage_of, test, _grows, slots=_slots) for name, test in _TESTS.items()
+    name: ChangeKind("share", _patch, _together, test, _grows, slots=_slots) for name, test in _TESTS.items()
 }
 
 

@@ -94,8 +94,8 @@ def _side(at: Any, _: Units, prefix: str) -> Any:
     return xp.take_along_axis(xp.concatenate([first, side], axis=-1), xp.argsort(order, axis=-1), axis=-1)
 
 
-SMOOTH_DEGREE = 8
-"""Largest total degree of the terms of a smooth field."""
+SMOOTH_DEGREE, FINEST_DEGREE = 6, 8
+"""Largest total degrees of the terms of a smooth field: of changes of the optics, and of cameras."""
 SMOOTH_LENGTH = 0.5
 """Length over which a smooth field changes, in units of the scale of the field."""
 
@@ -112,8 +112,8 @@ def smooth_deviations() -> tuple[float, ...]:
     """
     nodes, weights = np.polynomial.legendre.leggauss(64)
     kernel = np.exp(-0.5 * ((nodes[:, None] - nodes) / SMOOTH_LENGTH) ** 2)
-    values = np.polynomial.legendre.legvander(nodes, SMOOTH_DEGREE) * weights[:, None]
-    variances = np.einsum("ti,tu,ui->i", values, kernel, values) * (np.arange(SMOOTH_DEGREE + 1) + 0.5) ** 2
+    values = np.polynomial.legendre.legvander(nodes, FINEST_DEGREE) * weights[:, None]
+    variances = np.einsum("ti,tu,ui->i", values, kernel, values) * (np.arange(FINEST_DEGREE + 1) + 0.5) ** 2
     return tuple(np.sqrt(variances).tolist())
 
 
@@ -265,7 +265,7 @@ def values_at(at: Any) -> Callable[[str, Units], Any]:
 
     @functools.cache
     def polynomials(units: Units) -> list[list[Any]]:
-        return [legendre.polynomials(t / units.field, SMOOTH_DEGREE) for t in (at.x, at.y)]
+        return [legendre.polynomials(t / units.field, FINEST_DEGREE) for t in (at.x, at.y)]
 
     @functools.cache
     def value(text: str, units: Units) -> Any:
