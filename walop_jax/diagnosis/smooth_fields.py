@@ -32,6 +32,8 @@ from walop_jax.model import legendre
 from walop_jax.model.effects import Context
 from walop_jax.model.effects.factors import FINEST_DEGREE, smooth_deviations
 
+TOGETHER = 4_000_000  # products of columns at single field points that are held at once: 32 MB
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SmoothFields:
@@ -177,9 +179,15 @@ class SmoothFields:
 
     def _sums(self, rows: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "f c n"]:
         """Σ_p F_pf c_pᵀ V_p of all terms f and distinct changes c."""
-        sums = np.zeros((self._terms.shape[1], len(self._place), rows.shape[1]))
-        for point, at in enumerate(self._rows_of_points):
-            sums += self._terms[point][:, None, None] * (self._columns[at].T @ rows[at])
+        points, count = self._terms.shape
+        changes, columns = len(self._place), rows.shape[1]
+        sums = np.empty((count, changes, columns))
+        size = max(1, TOGETHER // max(1, points * columns))
+        for first in range(0, changes, size):
+            some = slice(first, first + size)
+            of_points = np.stack([self._columns[at, some].T @ rows[at] for at in self._rows_of_points])
+            of_terms = self._terms.T @ of_points.reshape(points, -1)
+            sums[:, some] = of_terms.reshape(count, *of_points.shape[1:])
         return sums
 
     def _of_field(self, sums: Float[np.ndarray, "f c n"], number: int) -> Float[np.ndarray, "a n"]:
