@@ -249,9 +249,10 @@ class _RoundInProgress:
     def others(self, names: Sequence[Probable]) -> list[Probable]:
         """Trials of what has no linear step, once in a round; [] when asked again.
 
-        They are compared with `names` by the evidence of their fits.
+        They are compared with `names` by the evidence of their fits. A round that adds a description has refuted them:
+        they are not asked beside it, where each would be another program with all amplitudes of the description.
         """
-        if self.others_asked:
+        if self.others_asked or any(step.groups for step in self.state.steps):
             return []
         self.others_asked = True
         trials, self.choices = self.judge.others(dataclasses.replace(self.state, fits=self.fits))

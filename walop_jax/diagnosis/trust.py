@@ -63,6 +63,7 @@ from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import beside, some
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
+from walop_jax.model.effects import Described
 from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.noise import COMMON
 
@@ -112,7 +113,9 @@ def examined(
     if not (near or as_written):
         refuse_mixups(result)
     seen = sampled(result)
-    cures = () if near else _remedies(result, seen, seed)
+    # What is left beside the descriptions of a diagnosis is no matter of larger errors, or of rows to be left out.
+    described = diagnosed is not None and Described.name in result.model.effect_names
+    cures = () if near or described else _remedies(result, seen, seed)
     if cures:
         return result.with_verdict(remedies=cures)
     if diagnosed is not None and seen is result:
