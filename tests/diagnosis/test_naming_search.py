@@ -114,6 +114,36 @@ def test_the_search_ends_after_the_steps_that_it_has(monkeypatch):
     assert len(names(evidence([25.0, 0.0, 20.0]), Linear())) == 1
 
 
+class AskingOthers(Counting):
+    """A judge by whose fits nothing is explained, so that what has no linear step is asked for; `asked` counts that."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = 0
+
+    def fitted(self, evidence, trial):
+        return dataclasses.replace(
+            super().fitted(evidence, trial), leaves_noise=False, remaining=evidence.chi2
+        )
+
+    def others(self, state):
+        self.asked += 1
+        return [], {}
+
+
+@pytest.mark.parametrize(
+    ("descriptions", "searched", "asked"), [(0, True, True), (2, True, False), (3, False, False)]
+)
+def test_descriptions_in_a_model_end_what_they_make_vain(descriptions, searched, asked):
+    """A third one ends the search; beside any of them no other instrument is thought of (of a poor fit: χ²/dof 2)."""
+    poor = evidence([0.0, 0.0, 25.0])
+    (added,) = search(State(poor), Linear()).steps
+    poor = dataclasses.replace(poor, chi2=2.0 * poor.dof)
+    steps = tuple(dataclasses.replace(added, groups={f"change {k}": ()}) for k in range(descriptions))
+    search(State(poor, steps=steps), judge := AskingOthers())
+    assert (bool(judge.fits), bool(judge.asked)) == (searched, asked)
+
+
 class Refusing(Counting):
     """A judge by whose fits the model is more probable without the name that is asked first."""
 

@@ -92,6 +92,30 @@ def test_evidence_beside_members_is_a_ratio_of_densities_of_the_residuals(member
             assert value == pytest.approx(expected, abs=1e-8)
 
 
+def test_amplitudes_that_the_data_cannot_show_do_nothing():
+    """The density without their columns, for candidates of one size of which different numbers are shown."""
+    rng = np.random.default_rng(6)
+    columns = {name: rng.standard_normal((ROWS, 3)) / np.sqrt(ROWS) for name in ("a pattern", "gain of O1")}
+    columns["a pattern"][:, 0] = 0.0
+    columns["gain of O1"][:, :2] *= 1e-6
+    found, columns, residual = scene({}, columns=columns, width=3.0)
+    evidence = JointScores(found).beside([])
+    for number, (name, shown) in enumerate({"a pattern": (1, 2), "gain of O1": (2,)}.items()):
+        for scale, value in zip(SCALES, evidence[number], strict=True):
+            terms = [(columns[name][:, k], 3.0 * scale) for k in shown]
+            assert value == pytest.approx(log_density(residual, terms) - log_density(residual, []), abs=1e-8)
+
+
+def test_a_candidate_may_have_more_than_a_thousand_amplitudes():
+    """As the disturbances of 334 exposures in three cameras have."""
+    rng = np.random.default_rng(7)
+    columns = {"a pattern": rng.standard_normal((ROWS, 1002)) / np.sqrt(ROWS)}
+    found, columns, residual = scene({}, columns=columns, width=0.1)
+    terms = [(column, 0.1 * SCALES[0]) for column in columns["a pattern"].T]
+    expected = log_density(residual, terms) - log_density(residual, [])
+    assert JointScores(found).beside([])[0, 0] == pytest.approx(expected, abs=1e-6)
+
+
 def test_an_amplitude_that_physics_keeps_above_0_has_the_half_of_its_prior():
     """∫₀^∞ 2 N(a; 0, w²) p(r | a) da / p(r | 0), by numbers."""
     first, second = np.random.default_rng(4).standard_normal((2, ROWS, 1)) / np.sqrt(ROWS)

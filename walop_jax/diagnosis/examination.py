@@ -292,9 +292,12 @@ class Examination(Evidence):
         of changes that are not tried with a gradient those without a pattern tell.
         """
         columns = self.design.columns
+        # What is the same everywhere in the field and in all exposures may be the same as a change that follows the
+        # field otherwise.
         by_description = {
             field.gradient if field.gradient in self.candidates else field.even: field
             for field in self.fields
+            if field.gradient in self.candidates or all(change.factors for change in field.changes)
         }
         also = {
             by_description[name].name: tuple(

@@ -27,7 +27,7 @@ from walop_jax.diagnosis.refits import (
     without,
 )
 from walop_jax.diagnosis.score import local_p
-from walop_jax.diagnosis.search import State
+from walop_jax.diagnosis.search import State, too_many_descriptions
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.fit.refit import FitResult, fit
 from walop_jax.io.text import with_error
@@ -53,7 +53,7 @@ def concluded(first: State, state: State, judge: Refits) -> Remainder:
     if remainder is not None:
         against = tuple(text for name, text in _contradicted(state).items() if name not in added)
         return state, dataclasses.replace(remainder, parts=(*remainder.parts, *against))
-    if len(added) <= thresholds.MOST_SENTENCES:
+    if not too_many_descriptions(state):
         return state, None
     text = f"{len(added)} descriptions were needed: they show its place, no single one its nature"
     remainder = Unexplained(state.evidence.table.p_global, f"{text} ({' | '.join(added)})", ())

@@ -112,13 +112,18 @@ def search(state: State, judge: TrialJudge) -> State:
             break
         if ended := judge.over(state.fits):
             return dataclasses.replace(state, ended=ended)
-        if sum(len(step.groups) for step in state.steps) > thresholds.MOST_SENTENCES:
-            break  # what so many descriptions are needed for is told as unexplained, whatever a further one would add
+        if too_many_descriptions(state):
+            break  # a further one would not make them an explanation
         trial, state = _next(state, judge)
         if trial is None:
             break
         state = judge.adopted(state, trial)
     return state
+
+
+def too_many_descriptions(state: State) -> bool:
+    """True if a model has more descriptions without a name than can explain data: what no two hold is unexplained."""
+    return sum(len(step.groups) for step in state.steps) > thresholds.MOST_SENTENCES
 
 
 def against(trial: Trial) -> str:

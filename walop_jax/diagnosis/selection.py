@@ -103,9 +103,8 @@ def most_probable(evidence: Evidence) -> MissingThings:
     return JointScores(evidence).posterior()
 
 
-TOGETHER = (
-    1_000_000  # products of columns of candidates of one size that are worked on at once: 8 MB of each array
-)
+# Products of columns of candidates of one size that are worked on at once: 8 MB of each array.
+TOGETHER = 1_000_000
 
 
 class JointScores:

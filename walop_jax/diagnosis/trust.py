@@ -63,7 +63,6 @@ from walop_jax.fit.verdict import NOT_MEASURED, Structure
 from walop_jax.io.text import beside, some
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Described
 from walop_jax.model.effects.in_models import known_effects
 from walop_jax.model.noise import COMMON
 
@@ -83,10 +82,14 @@ NOISELESS = 1e-6
 
 
 class Diagnosed(NamedTuple):
-    """What a diagnosis has of a fit: the fit laid out with its columns, and the scores of what the model may lack."""
+    """What a diagnosis has of a fit: the fit laid out with its columns, and the scores of what the model may lack.
+
+    `beyond_remedy` is True where the model has so many descriptions that nothing would make them an explanation.
+    """
 
     design: Design
     candidates: ScoreTable
+    beyond_remedy: bool = False
 
 
 def examined(
@@ -113,9 +116,7 @@ def examined(
     if not (near or as_written):
         refuse_mixups(result)
     seen = sampled(result)
-    # What is left beside the descriptions of a diagnosis is no matter of larger errors, or of rows to be left out.
-    described = diagnosed is not None and Described.name in result.model.effect_names
-    cures = () if near or described else _remedies(result, seen, seed)
+    cures = () if near or (diagnosed and diagnosed.beyond_remedy) else _remedies(result, seen, seed)
     if cures:
         return result.with_verdict(remedies=cures)
     if diagnosed is not None and seen is result:

@@ -50,7 +50,7 @@ from walop_jax.diagnosis.remainder import (
     rival_conditions,
     wrong_number,
 )
-from walop_jax.diagnosis.search import State, search
+from walop_jax.diagnosis.search import State, search, too_many_descriptions
 from walop_jax.diagnosis.stated_conditions import Singles, condition_scores
 from walop_jax.diagnosis.trust import Diagnosed, examined
 from walop_jax.fit.base_model import base_model
@@ -161,7 +161,10 @@ def diagnose(
         not_scored=_not_scored(catalogue, candidates, first.evidence.synonyms),
         descriptions=len(candidates.descriptions) + len(candidates.parts),
     )
-    of_fits = [Diagnosed(of.design, of.table) for of in (first.evidence, evidence)]
+    of_fits = (
+        Diagnosed(first.evidence.design, first.evidence.table),
+        Diagnosed(evidence.design, evidence.table, beyond_remedy=too_many_descriptions(state)),
+    )
     rivals = () if after is before else tuple(rival_conditions(first.evidence.design, conditions, after.chi2))
     del first, state, evidence  # the columns of all candidates, gigabytes of a large set
     return _examined(diagnosis, of_fits, rivals, seed)

@@ -7,7 +7,7 @@ stage, that of its class:
     Mixing          analysis vectors behind the throughput: part of the instrument, linear in the light
     GhostPart       light of the opposite field point
     ExposurePart    linear in the flux, but specific to each exposure
-    DetectorPart    acts on electrons; not linear in the light
+    DetectorPart    acts on electrons: may be not linear in the light, or mix cameras in single exposures
 
 `dependence.left_behind` lists the effects that do not carry over to other exposures.
 """

@@ -268,11 +268,8 @@ def _slots(instrument: Instrument, change: Change) -> list[SlotTerm]:
     """A stage and the cameras, and the camera whose light it is; for analysis vectors a slot for each camera, or target
     and origin.
     """
-    stage, cameras, origin = (
-        stage_of(change),
-        cameras_of(instrument, change.place),
-        _origin(instrument, change),
-    )
+    stage, cameras = stage_of(change), cameras_of(instrument, change.place)
+    origin = _origin(instrument, change)
     slots: list[tuple[Any, ...]] = [(stage, cameras) if origin is None else (stage, cameras, origin)]
     if stage == "mixed":
         slots = [(stage, cameras.index(1.0), origin)]
