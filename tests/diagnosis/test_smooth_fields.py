@@ -212,7 +212,6 @@ PLACES = (
     "gain of E1 * smooth",
     "light of E1 in O1 * smooth",
     "light of O2 in E1 * hours * smooth",
-    "light in E2 * smooth",
     "afterglow in O2 * smooth",
 )
 
