@@ -189,7 +189,7 @@ ERRORS = (
     planted("diagnosis/selection.py", "(self._is_named, self._is_effect)", "(self._is_named,)",
             "diagnosis/test_selection.py"),
     planted("diagnosis/selection.py", "mean = -np.einsum", "mean = np.einsum", "diagnosis/test_selection.py"),
-    planted("diagnosis/smooth_fields.py", "square - sum(", "square + sum(", "diagnosis/test_smooth_fields.py"),
+    planted("diagnosis/smooth_fields.py", "gram -= along", "gram += along", "diagnosis/test_smooth_fields.py"),
     planted("diagnosis/smooth_fields.py", "(scale * probe.widths) ** -2.0", "probe.widths**-2.0",
             "diagnosis/test_smooth_fields.py"),
     planted("diagnosis/smooth_fields.py", "legendre.basis(points.x, points.y,", "legendre.basis(points.y, points.x,",
