@@ -134,7 +134,7 @@ class AskingOthers(Counting):
 @pytest.mark.parametrize(
     ("descriptions", "searched", "asked"), [(0, True, True), (2, True, False), (3, False, False)]
 )
-def test_descriptions_in_a_model_end_what_they_make_vain(descriptions, searched, asked):
+def test_with_descriptions_in_its_model_a_search_asks_for_less(descriptions, searched, asked):
     """A third one ends the search; beside any of them no other instrument is thought of (of a poor fit: χ²/dof 2)."""
     poor = evidence([0.0, 0.0, 25.0])
     (added,) = search(State(poor), Linear()).steps

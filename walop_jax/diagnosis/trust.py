@@ -116,7 +116,8 @@ def examined(
     if not (near or as_written):
         refuse_mixups(result)
     seen = sampled(result)
-    cures = () if near or (diagnosed and diagnosed.beyond_remedy) else _remedies(result, seen, seed)
+    beyond_remedy = diagnosed is not None and diagnosed.beyond_remedy
+    cures = () if near or beyond_remedy else _remedies(result, seen, seed)
     if cures:
         return result.with_verdict(remedies=cures)
     if diagnosed is not None and seen is result:

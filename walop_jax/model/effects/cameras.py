@@ -158,18 +158,21 @@ class OfDetectors(_Cameras, DetectorPart):
         """The counts (e, k) with the additions of this stage."""
         added, total = ADDED[self.stage](counts, exposures), counts
         for change, origin, size in zip(self.changes, self.origins, self.sizes, strict=True):
-            of_exposures = any(factor.depends_on == EXPOSURE for factor in change.grows_with)
-            pattern = in_exposures(change, exposures, x, y) if of_exposures else change.factor(AtPoint(x, y))
+            differs = _differs_between_exposures(change)
+            pattern = in_exposures(change, exposures, x, y) if differs else change.factor(AtPoint(x, y))
             light = added if origin is None else added[:, origin, None]
             total = total + size * light * jnp.asarray(pattern, float)[..., None]
         return total
 
 
+def _differs_between_exposures(change: Change) -> bool:
+    return any(factor.depends_on == EXPOSURE for factor in change.grows_with)
+
+
 def stage_of(change: Change) -> str:
     """The stage at which a change acts: a key of `ADDED`, "throughput", "counts", "mixed" or "opposite"."""
-    still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     if change.kind == "light":
-        of_camera = "mixed" if still else "reported"
+        of_camera = "reported" if _differs_between_exposures(change) else "mixed"
         return {"": "median", OPPOSITE: "opposite"}.get(change.origin, of_camera)
     if change.kind != "gain":
         return {"reported gain": "reported", "afterglow": "afterglow"}[change.kind]
@@ -177,6 +180,7 @@ def stage_of(change: Change) -> str:
         if len(powers) > 1:
             raise ValueError(f"{change.text!r}: a gain grows with one of {', '.join(POWERS)}")
         return POWERS[powers[0]]
+    still = all(factor.depends_on in (FIELD, WAVELENGTH) for factor in change.grows_with)
     return "throughput" if still else "counts"
 
 
@@ -218,7 +222,7 @@ def _together(change: Change) -> tuple[str, bool]:
 
     Catalogues are corrected for these alone (`model.dependence`).
     """
-    return stage_of(change), any(factor.depends_on == EXPOSURE for factor in change.grows_with)
+    return stage_of(change), _differs_between_exposures(change)
 
 
 _WITH: Mapping[str, tuple[str, ...]] = {
