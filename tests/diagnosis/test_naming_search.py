@@ -11,7 +11,7 @@ from walop_jax.diagnosis.examination import Evidence
 from walop_jax.diagnosis.hypotheses import Probe
 from walop_jax.diagnosis.score import Projector, ScoreSpace
 from walop_jax.diagnosis.search import State, search
-from walop_jax.model.effects import Context, effect_by_name
+from walop_jax.model.effects import Context, Described, effect_by_name
 
 ROWS, PATTERN = 400, "a pattern without a name"
 NAMES = ("clp_zero", "rotator_zero", "lens_birefringence")
@@ -166,3 +166,33 @@ def test_a_name_that_is_improbable_is_not_asked_in_its_stead():
     judge = Refusing()
     assert names(evidence([14.0]), judge) == []
     assert judge.fits == [NAMES[0]]
+
+
+class Gross(Linear):
+    """A judge of a gross misfit: in its large errors a description has more evidence than the effect that explains all.
+
+    `left` is the χ² that the effect leaves once the errors are settled, beside 5000 of the description.
+    """
+
+    def __init__(self, left):
+        self.left = left
+
+    def fitted(self, evidence, trial):
+        found, left = (40.0, 5000.0) if trial.effect is Described else (35.0, self.left)
+        return dataclasses.replace(trial, evidence=found, remaining=left, leaves_noise=False)
+
+
+@pytest.mark.parametrize(
+    ("scale", "left", "first"),
+    [(10.0, 400.0, "clp_zero"), (10.0, 6000.0, "described"), (1.0, 400.0, "described")],
+)
+def test_of_a_gross_misfit_the_effect_is_fitted_beside_a_description(monkeypatch, scale, left, first):
+    """Linear steps prefer the description, by ½ 30² (1 − 0.99²) = 9 in ln B, and count where no misfit is gross."""
+    like = evidence([0.0, 0.0, 0.0, 30.0], pattern_like=0.99)
+    description = Probe(PATTERN, Described, ())
+    gross = dataclasses.replace(
+        like, descriptions=(description,), patterns=[], scale=scale, chi2=40_000.0, dof=400
+    )
+    monkeypatch.setattr(thresholds, "MOST_STEPS", 1)
+    (step,) = search(State(gross), Gross(left)).steps
+    assert step.effect.name == first

@@ -20,13 +20,15 @@ Undetected   With elements that the model does not let vary, the matrix has erro
                  E[δδᵀ] = Σ_g p_g (C_g + c_g c_gᵀ),   p_g = π B_g / (1 − π + π B_g)
              is added to the covariance; values stay those of the fit. A change that the data exclude adds nothing; one
              of which the data say nothing adds its prior variance; one that they suggest without an alarm adds its
-             size. One more change is expected among the candidates that act on calibration exposures and not on stars
-             (in time, temperature, KIND, counts, single exposures), and one among the numbers that the set states and
-             the data measure (TEFF, ROTATOR, the clock, coordinates), which may be wrong by up to ten of their standard
-             errors (`thresholds.MOST_WIDTHS`): these only shift the parameters. Numbers of which the data say nothing
-             are those of `undetected_errors`.
-Starlight    To first order any such change acts on a star like a change ahead of the train. A few changes there, chosen
-             one after the other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
+             size. One more change is expected among the candidates that differ between calibration exposures or are not
+             seen by stars (in time, temperature, KIND, counts, single exposures), and one among the numbers that the
+             set states and the data measure (TEFF, ROTATOR, the clock, coordinates), which may be wrong by up to ten of
+             their standard errors (`thresholds.MOST_WIDTHS`): these only shift the parameters. Of a change in exposures
+             of one KIND nothing says whether stars have it, as a gain of standards, which are stars: they have it with
+             a probability of a half. Numbers of which the data say nothing are those of `undetected_errors`.
+Starlight    To first order any such change acts on a star like changes ahead of the train and ahead of its arms: those
+             ahead of the train turn q and u alike, those of one arm q alone. A few changes there, chosen one after the
+             other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
              models that were not chosen, Draper 1995, J. R. Stat. Soc. B 57, 45
 Limits       First order; in the usual setting of the plates. Undetected changes of finer structure are not in it.
@@ -63,7 +65,7 @@ from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.instrument import Instrument
 
-LEFT_OUT = 1e-3  # share of the undetected variance of the matrix that a product may lack
+LEFT_OUT = 1e-2  # share of the variance of the elements of the matrix that a product may lack in the mean
 DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in names) for names in CUBIC)
 
 
@@ -244,28 +246,24 @@ class _Block(NamedTuple):
 
 
 def undetected(laid: LinearisedFit) -> OpenQuestion | None:
-    """Covariance of undetected changes, expressed by changes ahead of the train; None if there are no such changes."""
+    """Covariance of undetected changes, by changes ahead of train and arms; None if there are none."""
     if not (places := _steady_places(laid)):
         return None
-    step = laid.nothing_removed
-    data, front = _AtData.of(laid.columns), places[0]
+    step, data, front = laid.nothing_removed, _AtData.of(laid.columns), places[0]
     blocks = {place: block for place in places if (block := _block(laid, step, data, *place)) is not None}
     # Without light from the sky nothing ahead of the polariser is in the data.
     tried = [block for place, block in blocks.items() if place != front or block.gram.any()]
     if not tried or front not in blocks:
         return None
-    moments = _second_moments(tried, laid.state.scatter)
-    factors = [  # of the covariance of the matrix, its columns in units of the standard errors
-        _slopes(laid, block.sums, block.slopes) @ square_root(moment)
-        for block, moment in zip(tried, moments, strict=True)
-    ]
-    factors.append(laid.slopes @ _of_other_light(laid, step))
-    factors.append(laid.slopes @ _of_stated_numbers(laid, step))
-    errors = np.where(laid.errors > 0, laid.errors, np.inf)[..., None]
-    factor = (np.concatenate(factors, axis=-1) / errors).reshape(laid.errors.size, -1)
-    ahead = blocks[front]
-    slopes = _slopes(laid, ahead.sums, ahead.slopes)
-    chosen, loadings = _carrying((slopes / errors).reshape(laid.errors.size, -1), factor)
+    factor = _factor_of_matrix(laid, step, tried)
+    arms = tuple(f"{arm.name}." for arm in laid.template.arms)
+    ahead = [block for place, block in blocks.items() if place == front or _is_ahead_of(place, arms)]
+    sums = tuple(itertools.chain(*(block.sums for block in ahead)))
+    shifts = np.concatenate([block.slopes for block in ahead], axis=1)
+    slopes = _slopes(laid, sums, shifts)
+    total = np.sqrt(laid.errors**2 + np.sum(factor**2, axis=-1))
+    unit = np.where(total > 0.0, total, np.inf)[..., None]
+    chosen, loadings = _carrying(*((of / unit).reshape(total.size, -1) for of in (slopes, factor)))
     if not chosen:
         return None
     covariance = loadings @ loadings.T
@@ -273,14 +271,28 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     member = Answer(
         "undetected",
         0.0,
-        tuple(ahead.sums[j] for j in chosen),
+        tuple(sums[j] for j in chosen),
         amplitudes=np.zeros(len(chosen)),
         covariance=covariance,
-        slopes=ahead.slopes[:, chosen],
+        slopes=shifts[:, chosen],
     )
     return OpenQuestion.of_errors(
         "changes that the data would not show", member, laid.error_of_p(between), laid.stated
     )
+
+
+def _factor_of_matrix(
+    laid: LinearisedFit, step: LinearStep, blocks: Sequence[_Block]
+) -> Float[np.ndarray, "p m a"]:
+    """F, with F Fᵀ the covariance of the matrix by all undetected changes, of which `blocks` are the steady ones."""
+    moments = _second_moments(blocks, laid.state.scatter)
+    steady = [
+        _slopes(laid, block.sums, block.slopes) @ square_root(moment)
+        for block, moment in zip(blocks, moments, strict=True)
+    ]
+    numbers = laid.slopes @ _of_stated_numbers(laid, step)
+    of_stars, alone = _of_exposures(laid, step)
+    return np.concatenate([*steady, *of_stars, laid.slopes @ alone, numbers], axis=-1)
 
 
 def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
@@ -289,6 +301,12 @@ def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
     places = list(itertools.chain(*places_of(bare, laid.fit.calset.exposures)))
     front = places[:1] if bare.ahead_of_polariser is None else [bare.ahead_of_polariser]
     return [*front, *(place for place in places if place not in front)]
+
+
+def _is_ahead_of(place: tuple[str, str], prefixes: tuple[str, ...]) -> bool:
+    """True of a place ahead of an element whose name begins with one of `prefixes`."""
+    where, element = place
+    return where == "ahead of" and element.startswith(prefixes)
 
 
 def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
@@ -356,24 +374,50 @@ def _second_moment(
     return vector @ (covariance + np.outer(mean, mean)) @ vector.T
 
 
-def _of_other_light(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
-    """F, with F Fᵀ the covariance of the free parameters by undetected changes that act on no star.
+def _of_exposures(
+    laid: LinearisedFit, step: LinearStep
+) -> tuple[list[Float[np.ndarray, "p m _"]], AnyMatrix]:
+    """Undetected changes that differ between exposures: factors F of their covariances F Fᵀ.
 
     These are the candidates of an examination that depend on time, temperature, KIND, counts or an exposure, or that
-    do not change the light of a star.
+    do not change the light of a star. Those in exposures of one KIND are in the light of stars with a probability of a
+    half: the first factors are of the covariance of the matrix then. All others only shift the free parameters, of
+    whose covariance the last factor is.
     """
     state, count = laid.state, len(laid.fit.model.free)
-    absent = [probe for probe in state.asked if _no_starlight(probe, laid.template)]
-    if not absent:
-        return np.zeros((count, 0))
+    differing = [probe for probe in state.asked if _no_starlight(probe, laid.template)]
+    of_stars, covariance = list[AnyMatrix](), np.zeros((count, count))
+    if not differing:
+        return of_stars, covariance[:, :0]
     scores, places = laid.design.products(state.columns, step.left), state.bare.places()
     slopes = -step.projector.taken_up(laid.design.products(state.columns, step.projector.basis).T)
-    covariance, odds = np.zeros((count, count)), _odds(len(absent))
-    for probe in absent:
+    odds = _odds(len(differing))
+    for probe in differing:
         at = places[probe.name]
         moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.scatter)
+        if sums := _of_stars_as_well(laid, probe):
+            moment *= 0.5
+            of_stars.append(_slopes(laid, sums, slopes[:, at]) @ square_root(moment))
         covariance += slopes[:, at] @ moment @ slopes[:, at].T
-    return square_root(covariance)
+    return of_stars, square_root(covariance)
+
+
+def _of_stars_as_well(laid: LinearisedFit, probe: Probe) -> tuple[WeightedChanges, ...]:
+    """What a candidate in exposures of one KIND does to stars, if they have it; empty: it is no such candidate."""
+    groups = [total for member in probe.group for total in member.first_order(laid.template)]
+    kinds = {f for total in groups for _, c in total for f in c.grows_with if f.form == "kind"}
+    if len(kinds) != 1:
+        return ()
+    (kind,) = kinds
+    steady = tuple(
+        tuple(
+            (size, dataclasses.replace(c, factors=tuple(f for f in c.factors if f != kind.text)))
+            for size, c in total
+        )
+        for total in groups
+    )
+    same = all(kind.text in c.factors for total in groups for _, c in total)
+    return steady if same and all(map(laid.columns.has, steady)) else ()
 
 
 def _of_stated_numbers(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
@@ -405,7 +449,7 @@ def _of_stated_numbers(laid: LinearisedFit, step: LinearStep) -> AnyMatrix:
 
 
 def _no_starlight(probe: Probe, template: Instrument) -> bool:
-    """True of a candidate that changes calibration exposures and not the light of stars."""
+    """True of a candidate that changes calibration exposures and not the light of stars in the usual setting."""
     changes = [c for member in probe.group for total in member.first_order(template) for _, c in total]
     laws = ({item.depends_on for item in change.grows_with} & {EXPOSURE, COUNTS} for change in changes)
     return bool(changes) and all(
@@ -416,11 +460,13 @@ def _no_starlight(probe: Probe, template: Instrument) -> bool:
 def _carrying(columns: AnyMatrix, factor: AnyMatrix) -> tuple[list[int], AnyMatrix]:
     """Few `columns`, and loadings L, with columns[:, chosen] L Lᵀ columns[:, chosen]ᵀ close to factor factorᵀ.
 
-    One after the other the column that explains most of the rest, until less than `LEFT_OUT` is left.
+    Rows count in units of their own total error, so that badly known elements of the matrix do not hide well known
+    ones. One after the other the column that explains most of the rest, until less than `LEFT_OUT` of a row is left in
+    the mean over the rows.
     """
     remaining, rest, chosen = columns.copy(), factor.copy(), list[int]()
-    length, total = np.linalg.norm(columns, axis=0), float(np.sum(factor**2))
-    while len(chosen) < columns.shape[1] and np.sum(rest**2) > LEFT_OUT * total:
+    length = np.linalg.norm(columns, axis=0)
+    while len(chosen) < columns.shape[1] and np.sum(rest**2) > LEFT_OUT * len(rest):
         norm = np.linalg.norm(remaining, axis=0)
         unit = remaining / np.where(norm > 1e-6 * length, norm, np.inf)
         explained = np.sum((unit.T @ rest) ** 2, axis=1)

@@ -94,7 +94,7 @@ class Refits:
         else:
             shapes = sum(probe.effect is item.effect for probe in evidence.probes)
             refitted = try_shapes(evidence.result, item, shapes)
-        return dataclasses.replace(refitted, item=item, expected=trial.expected)
+        return _with_rest(dataclasses.replace(refitted, item=item, expected=trial.expected))
 
     def _description(self, evidence: Examination, item: Ranked) -> Described:
         """The description to be fitted: all terms of a smooth field, else the members worth their length."""
@@ -137,7 +137,7 @@ class Refits:
         described, compared = other_descriptions(
             result, allowed, self.tell, all_of_them=state.evidence.poor, earlier=state.choices
         )
-        return [*trials, *described], {**state.choices, **compared}
+        return [_with_rest(trial) for trial in (*trials, *described)], {**state.choices, **compared}
 
     def with_causes(self, state: State, effects: Sequence[Effect]) -> State:
         """The state with discrete causes (`discrete`) added, each fitted from the start values of the model.
@@ -199,6 +199,17 @@ class Refits:
         step = dataclasses.replace(trial, **found)
         self.tell(f"added {name}; scoring the residuals")
         return self.adopt(state, result, [*steps, step])
+
+
+def _with_rest(trial: Trial) -> Trial:
+    """The trial with the χ² that is left once its errors and priors are settled.
+
+    With the errors of a gross misfit the prior of an effect holds it far from the value that the data ask for.
+    """
+    if trial.fit is None or not trial.fit.converged or trial.fit.noise_scale <= 1.0:
+        return trial
+    rest = settled(trial.fit, [trial.effect.name])
+    return dataclasses.replace(trial, remaining=rest.chi2, leaves_noise=rest.explains_data)
 
 
 def settled(result: FitResult, names: Collection[str]) -> FitResult:

@@ -3,6 +3,8 @@
 1. `selection` says how many things are missing, and which names each of them may have, by linear steps from the fit.
 2. The names of the thing with the most evidence are fitted, the most probable first. That ends when a name
    leaves nothing but noise, or is, by its fit, more probable than every name not fitted yet is by its linear step.
+   Where that is a description, and the misfit is gross, the effect with the most evidence is fitted as well: of a gross
+   misfit linear steps miss more than the evidence of the one differs from that of the other.
 3. Where the fit is poor (`Evidence.poor`) and no name explains all but a tenth of the misfit (`thresholds.PART`), or
    where no name is left, changes that have no derivative compete with the names (`Refits.others`): structural effects
    and other descriptions of the instrument; where the fit is not poor, other curves of dispersion alone.
@@ -232,6 +234,28 @@ class _RoundInProgress:
                 passed.append((worth, trial))
         return passed
 
+    def effect_instead(self, passed: Sequence[Probable]) -> list[Probable]:
+        """The effect with the most evidence, fitted, where a misfit is gross and descriptions alone passed.
+
+        A misfit is gross if errors had to be scaled, or if the descriptions leave a poor fit. Linear steps are off by
+        parts of it, which the hundreds of amplitudes of a smooth field follow and the one amplitude of an effect
+        cannot. Which of the two is more probable their fits tell.
+        """
+        gross = self.evidence.scale > 1.0 or all(self._is_poor(trial) for _, trial in passed)
+        if not passed or not gross or any(trial.effect is not Described for _, trial in passed):
+            return []
+        item = next((item for item in self.evidence.ranked if item.name not in self.trials), None)
+        if item is None or self.judge.over(self.fits):
+            return []
+        self.fits += 1
+        trial = self.judge.fitted(self.evidence, linear_trial(self.evidence, item))
+        return self._by_fits([trial], passed)
+
+    @staticmethod
+    def _is_poor(trial: Trial) -> bool:
+        """True if the fit of a trial is poor."""
+        return trial.fit is not None and trial.remaining > thresholds.POOR_FIT * trial.fit.dof
+
     def _is_pattern(self, thing: Thing, trial: Trial, worth: float) -> bool:
         """True if a thing is more probably a pattern without a name than what a trial says; the trial is then refused.
 
@@ -262,10 +286,28 @@ class _RoundInProgress:
         self.others_asked = True
         trials, self.choices = self.judge.others(dataclasses.replace(self.state, fits=self.fits))
         self.fits += len(trials)
+        return self._by_fits(trials, names)
+
+    def _by_fits(self, trials: Iterable[Trial], names: Sequence[Probable]) -> list[Probable]:
+        """The trials that nothing speaks against, compared with `names` by the evidence of their fits."""
         unit = self.evidence.scatter**2
         best = max(names, key=lambda pair: pair[1].evidence, default=None)
         level = 0.0 if best is None else best[0] - best[1].evidence / unit
         return [(level + trial.evidence / unit, trial) for trial in trials if self.passes(trial)]
+
+    def compared(self, passed: Sequence[Probable]) -> list[Probable]:
+        """The trials as they are, or by their fits alone where errors had to be scaled.
+
+        In errors that the model without a trial asks for (`FitResult.noise_scale`), a misfit that one trial leaves and
+        another one does not would hardly count: what they explain is compared in the errors that the best of their fits
+        asks for.
+        """
+        scale, chi2 = self.evidence.scale, self.evidence.chi2
+        if scale <= 1.0 or not passed:
+            return list(passed)
+        needed = max(1.0, min(trial.remaining for _, trial in passed) / max(self.evidence.dof, 1))
+        finer = 0.5 * (1.0 / needed - 1.0 / scale**2)
+        return [(trial.evidence + finer * (chi2 - trial.remaining), trial) for _, trial in passed]
 
     def confirmed(self, passed: Iterable[Probable]) -> Trial | None:
         """The most probable trial that data which took no part in its fit confirm; None: there is none."""
@@ -312,12 +354,15 @@ def _next(state: State, judge: TrialJudge) -> tuple[Trial | None, State]:
     things = list(turn.posterior.things)
     while accepted is None and not judge.over(turn.fits):
         thing = things.pop(0) if things else None
-        passed = [] if thing is None else turn.names_of(thing)
+        names = [] if thing is None else turn.names_of(thing)
+        passed = names + turn.effect_instead(names)
         if (state.evidence.poor or thing is None) and not any(turn.explains(trial) for _, trial in passed):
             passed += turn.others(passed)
+        passed = turn.compared(passed)
         accepted = turn.confirmed(passed)
         if accepted is not None:
-            accepted = _with_rivals(state.evidence, accepted, thing, passed)
+            of_thing = any(accepted.name == trial.name for _, trial in names)
+            accepted = _with_rivals(state.evidence, accepted, thing if of_thing else None, passed)
         elif thing is None:
             break
         elif thing.is_pattern:  # a weaker one, fitted without it, would imitate it
@@ -347,12 +392,12 @@ def _candidate(evidence: Evidence, name: str, thing: Thing) -> Ranked | None:
 def _with_rivals(evidence: Evidence, trial: Trial, thing: Thing | None, passed: Iterable[Probable]) -> Trial:
     """A trial with its rivals, and its probability among them.
 
-    Rivals are the other names in the set of its thing, and names that passed and are not improbable beside it.
+    Rivals are the other names in the set of its thing (None: only its fit spoke for it, and the set is one of linear
+    steps), and names that passed and are not improbable beside it.
     """
     worth = {other.name: probable for probable, other in passed}
     near = [name for name, value in worth.items() if value > worth[trial.name] - thresholds.IMPROBABLE]
-    linear = thing.probabilities if thing is not None and trial.item is not None else {}
-    in_set = thing.names if thing is not None and trial.item is not None else ()
+    linear, in_set = ({}, ()) if thing is None else (thing.probabilities, thing.names)
     own = trial.name, trial.effect.name
     names = [name for name in dict.fromkeys([*in_set, *near]) if name not in own]
     effects = {item.effect.name for item in evidence.ranked}
