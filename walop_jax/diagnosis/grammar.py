@@ -301,6 +301,10 @@ def _of_cameras(
     yield Subject.of(*(gains[name] for name in cameras), arm=pairs)._replace(prefixes=turning)
     if arms:
         yield Subject.of(*(gains[arm.name] for arm in arms))
+    # How far a camera is from linear may depend on the exposure: on its length, on the temperature of an amplifier.
+    curved = {name: (base[0].times("counts"),) for name, base in gains.items()}
+    both = [tuple(itertools.chain(*(curved[name] for name in arm.analyser.cameras))) for arm in arms]
+    yield Subject.of(*(curved[name] for name in cameras), arm=both)
     for origin in ("", OPPOSITE) if over_field else ():
         yield Subject.of(*(_base(("light",), "in", name, origin) for name in cameras))
     if varies(exposures.mjd):

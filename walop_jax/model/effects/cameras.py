@@ -246,6 +246,7 @@ _CAMERA = (
     Combinations(("smooth",), (*SLOW, *SINGLE, "kind", "side"), ("alone", "arm")),
     Combinations(("any",), among=("alone", "arm")),  # finer than the throughput of the model
 )
+_NONLINEAR = (Combinations(("even", "any"), (*SLOW, *SINGLE, "kind"), ("alone", "arm")),)
 _ARM = (
     Combinations(along=(*SLOW, *SINGLE, "side", "night", "step", "kind")),
     Combinations(("rings",)),
@@ -261,6 +262,8 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     stage, tried = stage_of(change), (Combinations(among=("alone", "all")),)
     if change.kind == "afterglow":
         tried = (*tried, Combinations(("any",)))
+    elif change.kind == "gain" and stage in POWERS.values():
+        tried = _NONLINEAR
     elif change.kind == "gain":
         tried = _CAMERA if change.place in instrument.cameras.names else _ARM
     elif change.kind == "light" and change.origin != OPPOSITE:

@@ -220,6 +220,7 @@ def beside(instrument: Instrument, element: Element, relation: str, place: str) 
 
 _FIELD = ("even", "tilt", "r2", "astigmatic")
 _NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
+_ANY = ("even", "any")
 _ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
 _TURN = (
     Combinations(_FIELD, ("steady", *SLOW)),
@@ -228,25 +229,31 @@ _TURN = (
 )
 
 
+def _in_exposures(*laws: str) -> Combinations:
+    """All optics at a place together, the same everywhere in the field, under each of the laws."""
+    return Combinations(along=laws, among=("anything",))
+
+
 def _grows(instrument: Instrument, change: Change) -> Grows:
     """Optics: with the quantities of a ray and the angle of their element; the polariser: by exposure."""
     kind, polariser = change.kind, instrument.polariser
     over = _NOT_IN_OTHER_KINDS.get(kind.rpartition(" ")[2], _FIELD)
     always = Combinations(over, ("steady", *SLOW))
     if change.is_of_sky(instrument):
-        single = Combinations(along=SINGLE), Combinations(over[:3], ("kind",))
-        return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING))
+        single = Combinations(_ANY, SINGLE), Combinations(over[:3], ("kind",))
+        return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING, _in_exposures(*SINGLE, "kind")))
     if change.relation != "of":
         further = (
             Combinations(over, ("colour",)),
-            Combinations(along=OF_RAY),
+            Combinations(_ANY, OF_RAY),
             Combinations(among=("all",)),
             _ANYTHING,
+            _in_exposures(*OF_RAY),
         )
         return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
-        waves, single = Combinations(over, ("harmonics to 2",)), Combinations(along=(*SINGLE, "side"))
-        film = always, waves, single, _ANYTHING
+        waves, single = Combinations(over, ("harmonics to 2",)), Combinations(_ANY, (*SINGLE, "side"))
+        film = always, waves, single, _ANYTHING, _in_exposures(*SINGLE, "side")
         as_a_turn = {"turn": _TURN, "retardance v": ()}
         return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
     moves, waves = instrument.element(change.place).moves or "", Combinations(over, ("harmonics to 2",))
