@@ -61,6 +61,7 @@ COMBINED = (  # a pattern over the field with a dependence of the exposures, by 
     "added polarisation q ahead of polariser * r2 * hours; added polarisation u ahead of polariser * r2 * hours",
     "light in E2 * kind moon",
     "gain of O2 * side CHWP",
+    "gain of O2 * counts * kelvin; gain of E2 * counts * kelvin",
     "gain of E1 * side CHWP * x; gain of E1 * side CHWP * y",
     "turn of polariser * kelvin * r2",
     "displacement x ahead of pupil * r2 * kelvin; displacement y ahead of pupil * r2 * kelvin",
@@ -73,6 +74,12 @@ ALSO = (  # as faint as their plausible sizes are
     "added polarisation q ahead of polariser * hours; added polarisation u ahead of polariser * hours",
     "diattenuation q ahead of polariser * kind standard; diattenuation u ahead of polariser * kind standard",
     "retardance radial behind half2.plate * hours",
+    "gain of E1 * counts * per EXPTIME",
+    "; ".join(
+        f"{what} {axis} behind collimator * per EXPTIME"
+        for what in ("diattenuation", "retardance", "depolarisation")
+        for axis in "quv"
+    ),
 )
 RATIO = 15.0  # of what is hidden to the noise, behind the base
 HELD = 0.999  # share of the square of what an effect does that its sentences hold

@@ -107,6 +107,8 @@ def test_every_smooth_field_can_be_said_of_its_instrument(name):
         light = {c.beside_field for c in changes if c.kind == "light" and c.origin in origins}
         assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= light
     assert any(change.kind == "afterglow" for change in changes)
+    of_optics = {change.beside_field for field in fields for change in field.changes if not change.of_camera}
+    assert {("kind clp",), ("kind moon",), ("kind standard",), ("order",)} <= of_optics
     laws = {change.beside_field for change in changes if change.kind == "gain"}
     assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= laws
     assert any(len(law) == 1 and law[0].startswith("hours 4.5 to ") for law in laws)
@@ -209,6 +211,8 @@ PLACES = (
     "depolarisation of polariser * kelvin * smooth",
     "diattenuation v ahead of polariser * smooth * kind moon",
     "gain of O1 * counts * smooth",
+    "gain of O1 * counts * kind moon * smooth",
+    "retardance v behind half1.plate * smooth * kind standard",
     "gain of E1 * smooth",
     "light of E1 in O1 * smooth",
     "light of O2 in E1 * hours * smooth",

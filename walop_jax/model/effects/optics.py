@@ -222,16 +222,13 @@ _FIELD = ("even", "tilt", "r2", "astigmatic")
 _NOT_IN_OTHER_KINDS = {"q": _FIELD[:3], "u": _FIELD[:3], "radial": _FIELD[:1], "diagonal": _FIELD[:1]}
 _ANY = ("even", "any")
 _ANYTHING = Combinations(_FIELD[:3], ("steady", "hours", "kelvin"), ("anything",))
+# Exposures of one KIND show so few of nine kinds of polarisation that all of them would be two of them once more.
+_ANYTHING_ELSE = Combinations(along=SINGLE, among=("anything",))
 _TURN = (
     Combinations(_FIELD, ("steady", *SLOW)),
     Combinations(along=("harmonics to 6", *SINGLE, "side", "night", "step", "spell", "exposure")),
     Combinations(("tilt", "r2"), ("harmonics to 1",)),  # a beam that wanders over a non-uniform film
 )
-
-
-def _in_exposures(*laws: str) -> Combinations:
-    """All optics at a place together, the same everywhere in the field, under each of the laws."""
-    return Combinations(along=laws, among=("anything",))
 
 
 def _grows(instrument: Instrument, change: Change) -> Grows:
@@ -241,19 +238,19 @@ def _grows(instrument: Instrument, change: Change) -> Grows:
     always = Combinations(over, ("steady", *SLOW))
     if change.is_of_sky(instrument):
         single = Combinations(_ANY, SINGLE), Combinations(over[:3], ("kind",))
-        return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING, _in_exposures(*SINGLE, "kind")))
+        return Grows((FIELD, EXPOSURE), None, (always, *single, _ANYTHING, _ANYTHING_ELSE))
     if change.relation != "of":
         further = (
             Combinations(over, ("colour",)),
             Combinations(_ANY, OF_RAY),
             Combinations(among=("all",)),
             _ANYTHING,
-            _in_exposures(*OF_RAY),
+            _ANYTHING_ELSE._replace(along=("per EXPTIME",)),
         )
         return Grows((FIELD, WAVELENGTH, EXPOSURE), tried=(always, *further))
     if polariser is not None and change.place == polariser.name:
         waves, single = Combinations(over, ("harmonics to 2",)), Combinations(_ANY, (*SINGLE, "side"))
-        film = always, waves, single, _ANYTHING, _in_exposures(*SINGLE, "side")
+        film = always, waves, single, _ANYTHING, _ANYTHING_ELSE
         as_a_turn = {"turn": _TURN, "retardance v": ()}
         return Grows((FIELD, EXPOSURE), None, as_a_turn.get(kind, film))
     moves, waves = instrument.element(change.place).moves or "", Combinations(over, ("harmonics to 2",))
