@@ -172,7 +172,8 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
     """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with.
 
     Changes that begin or end at some time are tried without a pattern, but for smooth fields. Where the counts of two
-    cameras are known but for a common factor, a gain of one is a gain of the other, which is asked for alone.
+    cameras are known but for a common factor, a gain of one is a gain of the other, which is asked for alone. Of optics
+    the most frequent KIND is left out, as it is without a pattern: what it shows would be told twice, once as steady.
     """
     found: dict[str, SmoothField] = {}
     bare = dataclasses.replace(instrument, effects=())
@@ -205,8 +206,8 @@ def _with_laws(
     over_field, everything = points >= FEWEST_POINTS, np.ones(len(exposures), bool)
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
         seen = everything if inside is None else inside
-        shown = Dependences(exposures, over_field, prefixes, seen, every_kind)
         first = bases["alone"][0][0]
+        shown = Dependences(exposures, over_field, prefixes, seen, every_kind and first.of_camera)
         order = (
             -1 if first.relation in ("behind", "ahead of") else 1
         )  # between elements the pattern comes first
