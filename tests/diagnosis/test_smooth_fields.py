@@ -108,7 +108,7 @@ def test_every_smooth_field_can_be_said_of_its_instrument(name):
         assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= light
     assert any(change.kind == "afterglow" for change in changes)
     of_optics = {change.beside_field for field in fields for change in field.changes if not change.of_camera}
-    assert {("kind moon",), ("kind standard",), ("order",)} <= of_optics
+    assert {("kind moon",), ("kind standard",)} <= of_optics
     assert ("kind clp",) not in of_optics, "hardly anything but a steady change by another name"
     laws = {change.beside_field for change in changes if change.kind == "gain"}
     assert {(), ("kind clp",), ("kind moon",), ("kind standard",), ("hours",)} <= laws

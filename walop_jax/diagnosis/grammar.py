@@ -172,8 +172,9 @@ def smooth_fields(instrument: Instrument, exposures: Exposures, points: int) -> 
     """All changes that may vary over the field: each place and law once, of whichever patterns it is tried with.
 
     Changes that begin or end at some time are tried without a pattern, but for smooth fields. Where the counts of two
-    cameras are known but for a common factor, a gain of one is a gain of the other, which is asked for alone. Of optics
-    the most frequent KIND is left out, as it is without a pattern: what it shows would be told twice, once as steady.
+    cameras are known but for a common factor, a gain of one is a gain of the other, which is asked for alone. In the
+    most frequent KIND gains and light of cameras alone are asked for: what it shows of optics would be told twice, once
+    as a change that is always there.
     """
     found: dict[str, SmoothField] = {}
     bare = dataclasses.replace(instrument, effects=())
@@ -207,7 +208,8 @@ def _with_laws(
     for bases, prefixes, inside in _subjects(instrument, exposures, over_field=over_field):
         seen = everything if inside is None else inside
         first = bases["alone"][0][0]
-        shown = Dependences(exposures, over_field, prefixes, seen, every_kind and first.of_camera)
+        of_light = first.of_camera and not first.factors
+        shown = Dependences(exposures, over_field, prefixes, seen, every_kind and of_light)
         order = (
             -1 if first.relation in ("behind", "ahead of") else 1
         )  # between elements the pattern comes first
