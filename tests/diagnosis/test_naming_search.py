@@ -161,6 +161,25 @@ def test_the_other_name_of_the_set_is_asked_once_the_most_probable_one_is_refuse
     assert sorted(judge.fits) == sorted(NAMES[:2])
 
 
+class Unconfirmed(Counting):
+    """A judge who finds in data that were left out that they contradict the name that is asked first."""
+
+    def confronted(self, evidence, trial):
+        against = "KIND moon" if trial.effect.name == self.fits[0] else ""
+        return dataclasses.replace(trial, against=against)
+
+
+def test_the_other_name_of_the_set_is_asked_once_data_contradict_the_most_probable_one():
+    """As above: both are in the set. Of a set of one name nothing is left to ask."""
+    judge = Unconfirmed()
+    (added,) = names(evidence([14.0], shared=0.999), judge)
+    assert added == judge.fits[1]
+    assert sorted(judge.fits) == sorted(NAMES[:2])
+    judge = Unconfirmed()
+    assert names(evidence([14.0]), judge) == []
+    assert judge.fits == [NAMES[0]]
+
+
 def test_a_name_that_is_improbable_is_not_asked_in_its_stead():
     """0.97: ½ 14² (1 − 0.97²) = 5.8 in ln B, a probability of 0.3 %."""
     judge = Refusing()
