@@ -9,8 +9,9 @@
    where no name is left, changes that have no derivative compete with the names (`Refits.others`): structural effects
    and other descriptions of the instrument; where the fit is not poor, other curves of dispersion alone.
 4. The most probable name that held-out data confirm joins the model, and the residuals are scored again. If they
-   confirm none, the other names of its set are fitted. After these the next thing is tried, unless the first one is best
-   described by a pattern: a weaker thing would then be fitted to a model that lacks the stronger one, and imitate it.
+   confirm none, the other names of its set are fitted. After these the next thing is tried, unless the first one is
+   best described by a pattern: a weaker thing would then be fitted to a model that lacks the stronger one, and imitate
+   it.
 
 All are functions of a `State`, which never changes. `against` has the rules by which a trial is refused; one more is
 that a pattern without a name is more probable (`_RoundInProgress._is_pattern`). A `TrialJudge`
