@@ -285,6 +285,21 @@ def test_a_time_that_is_the_time_of_one_kind_may_be_that_kind():
     assert found.members[1].probability == pytest.approx(0.5, abs=0.05)
 
 
+def test_a_time_that_is_the_time_of_two_kinds_may_be_that_of_the_third():
+    """Moon and standards are the last exposures: from their time on, or in those of the polariser the other way."""
+    calset = set_with(3, {"gain of O1 * kind clp": -3e-3})
+    e = calset.exposures
+    hours = 24.0 * (e.mjd - e.mjd.min())
+    start = 0.5 * (hours[e.kind == "clp"].max() + hours[e.kind != "clp"].min())
+    assert start > hours[e.kind == "clp"].max()
+    text = f"gain of O1 * {grammar.between(start, grammar.end_of(e))}"
+    state = examined_with(fit_with(calset, text))
+    (found,) = ambiguities(state, {text: ()}).additions
+    assert {m.name: m.probability for m in found.members} == pytest.approx(
+        {text: 0.5, "gain of O1 * kind clp": 0.5}, abs=0.05
+    )
+
+
 def test_the_other_kinds_are_as_probable_whatever_the_size():
     """An amplitude of five prior widths has a wider prior: the same one in the other exposures has that too."""
     text = "gain of O1 * kind standard"

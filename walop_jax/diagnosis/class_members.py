@@ -43,7 +43,7 @@ from walop_jax.fit.refit import PRIOR_EDGE
 from walop_jax.io.shapes import AnyMatrix, AnyVector
 from walop_jax.likelihood.starlight import added_to_starlight
 from walop_jax.model.effects import Described
-from walop_jax.model.effects.change import KINDS, Change, patched
+from walop_jax.model.effects.change import KINDS, Change, InExposures, patched
 from walop_jax.model.effects.in_models import effects_of
 from walop_jax.model.effects.optics import GENERATORS
 
@@ -352,24 +352,23 @@ class LinearStep:
         return self.member(name, sums, column, self._widths(addition.sums), addition.evidence)
 
     def in_other_kinds(self, member: Answer, widths: AnyVector | None = None) -> Answer | None:
-        """The counterpart of a member that acts in exposures of one KIND: in all other KINDs, with the other sign.
+        """The counterpart of a member that acts in some KINDs of exposures alone: in all others, with the other sign.
 
-        None for a member that is not about one KIND. The `evidence` of the counterpart is given relative to that of the
-        member. `widths` are the prior widths of the member; None: those of its descriptions.
+        A span of time that holds all exposures of some KINDs, and no others, may be these KINDs. None for a member that
+        is not about KINDs. The `evidence` of the counterpart is given relative to that of the member. `widths` are the
+        prior widths of the member; None: those of its descriptions.
         """
-        kinds_by_change = [
-            [str(text).removeprefix("kind ") for text in description.factors if str(text).startswith("kind ")]
-            for description in changes_in(member.sums)
-        ]
+        in_kinds = {description: self._kinds_of(description) for description in changes_in(member.sums)}
+        kinds = {names for _, names in in_kinds.values()}
         exposures, design = self.laid.fit.calset.exposures, self.laid.design
-        kinds = set(itertools.chain(*kinds_by_change))
-        other_kinds = [str(name) for name in np.unique(exposures.kind) if str(name) not in kinds]
-        if len(kinds) != 1 or not all(kinds_by_change) or not other_kinds:
+        here = next(iter(kinds)) if len(kinds) == 1 else frozenset()
+        other_kinds = [str(name) for name in np.unique(exposures.kind) if str(name) not in here]
+        if not here or not other_kinds:
             return None
-        (kind,) = kinds
 
         def elsewhere(description: Change, other: str) -> Change:
-            factors = (f"kind {other}" if text == f"kind {kind}" else text for text in description.factors)
+            law, _ = in_kinds[description]
+            factors = (f"kind {other}" if text == law else text for text in description.factors)
             return dataclasses.replace(description, factors=tuple(factors))
 
         sums = tuple(
@@ -388,6 +387,20 @@ class LinearStep:
         alike = max(thresholds.CERTAIN_ODDS, thresholds.LINEAR * abs(member.evidence))
         near = abs(twin.evidence - member.evidence) < alike
         return twin._replace(evidence=0.0 if near else twin.evidence - member.evidence)
+
+    def _kinds_of(self, change: Change) -> tuple[str, frozenset[str]]:
+        """The factor by which a change acts in exposures of some KINDs and in no others, and these KINDs.
+
+        Both are empty for a change without such a factor.
+        """
+        exposures, kind = InExposures(self.laid.columns.exposures), self.laid.fit.calset.exposures.kind
+        for law in change.grows_with:
+            if law.form in ("kind", "hours"):
+                inside = np.asarray(law.value(exposures, change.units)) > 0.0
+                names = frozenset(map(str, kind[inside]))
+                if np.array_equal(inside, np.isin(kind, sorted(names))):
+                    return law.text, names
+        return "", frozenset()
 
     def member(
         self,
