@@ -328,6 +328,8 @@ def test_every_effect_has_words_of_its_own():
     words = [effect_in_words(effect.name) for effect in EFFECTS]
     assert len(set(words)) == len(EFFECTS)
     assert [text for text in words if len(text) < 15 or "=" in text] == []
+    # Names keep their capital letter inside a sentence.
+    assert {text.split()[0] for text in words if text[0].isupper()} == {"Stokes", "Wollaston"}
 
 
 def test_an_effect_of_ones_own_has_those_of_its_docstring():

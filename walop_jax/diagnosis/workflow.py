@@ -59,7 +59,7 @@ from walop_jax.fit.verdict import Quality
 from walop_jax.io.progress import Stage
 from walop_jax.likelihood.layout import thinned
 from walop_jax.likelihood.likelihood import Likelihood
-from walop_jax.model.effects import Described, Effect, EffectKind
+from walop_jax.model.effects import Described, Effect, EffectKind, in_a_sentence
 from walop_jax.model.effects.in_models import effect_context, known_effects
 from walop_jax.model.parameters import values_of
 from walop_jax.model.specification import Model
@@ -329,7 +329,6 @@ def _finished(trial: Trial, evidence: Examination, added: Sequence[str]) -> Step
 
 def _about(effect: Effect, cameras: Sequence[str]) -> str:
     """An effect in words, with its place: "a dark spot in front of one camera, O2"."""
-    first = (effect.kind.__doc__ or effect.name).strip().splitlines()[0].rstrip(".")
     chosen = spoken_choices(effect)
     places = [str(cameras[value]) if name == "camera" else str(value) for name, value in chosen.items()]
-    return ", ".join((first[:1].lower() + first[1:], *places))
+    return ", ".join((in_a_sentence(effect.kind), *places))

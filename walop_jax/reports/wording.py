@@ -12,12 +12,10 @@ from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.kinds import CALIBRATION_PLATE, POLARISER
 from walop_jax.io.errors import DataError
 from walop_jax.io.text import date_of, some, with_minus_sign
-from walop_jax.model.effects import EFFECTS, EffectKind
+from walop_jax.model.effects import EFFECTS, EffectKind, in_a_sentence
 from walop_jax.model.effects.free_form import FreeForm
 from walop_jax.reports.style import texts
 from walop_jax.sky.nights import night_of
-
-_PROPER = ("Wollaston", "Moon", "Stokes")
 
 
 def effect_in_words(name: str, catalogue: Iterable[EffectKind] = EFFECTS) -> str:
@@ -25,10 +23,7 @@ def effect_in_words(name: str, catalogue: Iterable[EffectKind] = EFFECTS) -> str
     if name == FreeForm.name:
         return "unidentified patterns"
     kind = next((entry for entry in catalogue if entry.name == name), None)
-    if kind is None:
-        return ""
-    text = (kind.__doc__ or "").strip().splitlines()[0].rstrip(".")
-    return text if text.startswith(_PROPER) else text[:1].lower() + text[1:]
+    return "" if kind is None else in_a_sentence(kind)
 
 
 def listed(items: Sequence[str]) -> str:

@@ -27,6 +27,20 @@ def effect_by_name(name: str, catalogue: Sequence[EffectKind] = EFFECTS) -> Effe
     )
 
 
+_PROPER = ("Wollaston", "Moon", "Stokes")
+"""Names with which the words of an effect may begin, and which keep their capital letter."""
+
+
+def in_a_sentence(effect: EffectKind) -> str:
+    """What an effect is, as it may stand inside a sentence.
+
+    >>> in_a_sentence(effect_by_name("hwp1_axis"))
+    'fast axis of HWP1 turned'
+    """
+    text = (effect.__doc__ or effect.name).strip().splitlines()[0].rstrip(".")
+    return text if text.startswith(_PROPER) else text[:1].lower() + text[1:]
+
+
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Effects in the order of the light path; those outside the catalogue come last.
 
