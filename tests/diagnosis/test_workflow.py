@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from between_points import WORST, between_points
 from scenes import PLAN
+from scipy import stats
 
 from walop_jax.calibration.calibration import Calibration
 from walop_jax.data.calset import read_calibration_set
 from walop_jax.diagnosis.design import Design, exposure_folds, field_folds, held_out
 from walop_jax.diagnosis.examination import examine
-from walop_jax.diagnosis.findings import document
+from walop_jax.diagnosis.findings import FitComparison, document
 from walop_jax.diagnosis.hypotheses import Hypotheses, probes
+from walop_jax.diagnosis.refits import held_out_by
 from walop_jax.diagnosis.workflow import diagnose
 from walop_jax.fit.base_model import base_model
 from walop_jax.fit.refit import fit, refit
@@ -79,6 +81,7 @@ def laid_out(columns, residual, widths, effects, scale=1.0):
     at = np.linalg.lstsq(rows, residual, rcond=None)[0]
     given = {
         "fit": fit,
+        "projector": SimpleNamespace(free=200 - len(widths)),
         "point": np.repeat(np.arange(40), 5),
         "jacobian": rows,
         "residual": residual - rows @ at,
@@ -106,6 +109,32 @@ def test_held_out_data_count_by_the_covariance_of_their_prediction():
         spread = np.eye(out.sum()) + a @ np.linalg.solve(normal[:2, :2], a.T)
         total += 4.0 * error @ np.linalg.solve(spread, error)
     assert held_out(design, "field blocks") == pytest.approx(total / 200, rel=1e-9)
+
+
+@pytest.mark.parametrize(("size", "confirmed"), [(3.0, True), (0.0, False)])
+def test_a_field_that_no_other_points_predict_is_confirmed_by_its_probability(size, confirmed):
+    """Every point has a number of its own; what the field says of other points is wrong, and vague: ln p by hand."""
+    rng = np.random.default_rng(4)
+    point, nothing = np.repeat(np.arange(40), 5), np.zeros((200, 1))
+    blocks = (np.eye(40) + 0.1 * rng.standard_normal((40, 40)))[point]
+    data = rng.standard_normal(200) + size * rng.standard_normal(40)[point]
+    before = laid_out(nothing, data, np.ones(1), [])
+    after = laid_out(np.hstack([nothing, blocks]), data, np.append(1.0, np.full(40, 3.0)), list(range(1, 41)))
+    found = held_out_by(before, after, "field blocks")
+    fold, logs = field_folds(before), []
+    for prior, scale in ((0.0, max(1.0, data @ data / 199)), (9.0, 1.0)):
+        covariance = prior * blocks @ blocks.T + np.eye(200)
+        logs.append(0.0)
+        for k in np.unique(fold):
+            out, kept = fold == k, fold != k
+            along = np.linalg.solve(covariance[np.ix_(kept, kept)], covariance[np.ix_(kept, out)])
+            spread = covariance[np.ix_(out, out)] - covariance[np.ix_(out, kept)] @ along
+            logs[-1] += stats.multivariate_normal(np.zeros(out.sum()), scale * spread).logpdf(
+                data[out] - along.T @ data[kept]
+            )
+    assert found["heldout_after"] >= found["heldout_before"]
+    assert found["heldout_gain"] == pytest.approx(logs[1] - logs[0], rel=0.05)
+    assert FitComparison(**found).confirmed == confirmed
 
 
 def test_what_other_data_do_not_determine_speaks_against_no_effect():

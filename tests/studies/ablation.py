@@ -156,7 +156,7 @@ MOST_KEPT = 3  # examinations beside the first: each has the columns of all cand
 SLOW: tuple[Place, ...] = (
     (workflow, "fit"), (workflow, "causes_of"), (refits, "examine"), (refits, "fit"), (refits, "try_effect"),
     (exact, "try_effect"), (refits, "other_descriptions"), (refits, "refit_without"), (refits, "before_and_after"),
-    (remainder, "try_effect"), (remainder, "evidence_of_presence"), (remainder, "held_out"), (refits, "held_out"),
+    (remainder, "try_effect"), (remainder, "evidence_of_presence"), (refits, "held_out"),
 )  # fmt: skip
 """Work that no rule is in: searches of one set do it once, up to where they part."""
 

@@ -470,6 +470,11 @@ def field_folds(design: Design) -> Int[np.ndarray, " d"]:
     return ((cut(points.x, 5) + 2 * cut(points.y, 5)) % HOLDOUT_FOLDS)[design.point]
 
 
+def folds(design: Design, scheme: str) -> Int[np.ndarray, " d"]:
+    """Fold of every data row in a scheme, "exposures" or "field blocks"."""
+    return {"exposures": exposure_folds, "field blocks": field_folds}[scheme](design)
+
+
 def held_out(design: Design, scheme: str) -> float:
     """Mean squared normalised residual on data that took no part in a fit: each fold is predicted by the others.
 
@@ -486,7 +491,7 @@ def held_out(design: Design, scheme: str) -> float:
     Symbols     A rows of the Jacobian of the fold, H normal matrix of all other rows, both of the parameters besides
                 those of effects
     """
-    fold = {"exposures": exposure_folds, "field blocks": field_folds}[scheme](design)
+    fold = folds(design, scheme)
     squares, (unit, _) = np.zeros(HOLDOUT_FOLDS), unit_columns(design.jacobian)
     ridge, model = 1e-12 * np.eye(unit.shape[1]), design.fit.model
     of_effects = [design.columns_of(model.positions(name)) for name in model.effect_names]

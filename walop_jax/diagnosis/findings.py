@@ -152,7 +152,8 @@ class FitComparison:
     `change_of_qu` is the largest change that adding it makes to calibrated q or u of a star with p ≤ 5 % at any field
     point. `residual_before` and `residual_after` are the residuals (data − model, in standard deviations as given;
     point, exposure, camera) at the time it was added; where another name has been dropped since, they and χ² are of
-    fits without that name.
+    fits without that name. `heldout_gain` is the gain in ln p of the data left out where their mean square became
+    larger (NaN: it did not).
     """
 
     chi2_before: float = float("nan")
@@ -161,14 +162,18 @@ class FitComparison:
     heldout_scheme: str = ""
     heldout_before: float = float("nan")
     heldout_after: float = float("nan")
+    heldout_gain: float = float("nan")
     change_of_qu: float = float("nan")
     residual_before: ResidualCube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
     residual_after: ResidualCube = dataclasses.field(default_factory=lambda: np.zeros((0, 0, 4)))
 
     @property
     def confirmed(self) -> bool:
-        """True if held-out data agree better with the addition than without."""
-        return self.heldout_after < self.heldout_before
+        """True if held-out data agree better with the addition than without, or are more probable with it.
+
+        A smooth field knows little of parts of the field that were left out, and knows that it does.
+        """
+        return self.heldout_after < self.heldout_before or self.heldout_gain > 0.0
 
     @property
     def negligible(self) -> bool:
@@ -521,8 +526,8 @@ def _described(change: Change, amplitude: float, sigma: float) -> dict[str, Any]
 
 _AS_THEY_ARE = (
     "effect", "score", "p_value", "chi2_before", "chi2_after", "heldout_before", "heldout_after", "heldout_scheme",
-    "alternatives", "equivalent", "nameless", "also_called", "separated_by", "where", "confirmed", "log_bayes",
-    "negligible", "probability",
+    "heldout_gain", "alternatives", "equivalent", "nameless", "also_called", "separated_by", "where", "confirmed",
+    "log_bayes", "negligible", "probability",
 )  # fmt: skip
 
 
@@ -580,6 +585,8 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
     if step.get("heldout_before") is not None and step.get("heldout_after") is not None:
         means = f"{step['heldout_before']:.3g} → {step['heldout_after']:.3g}"
         held = f"; mean squared residual of data left out ({step.get('heldout_scheme', '')}) {means}"
+        if (gain := step.get("heldout_gain")) is not None:
+            held += f", which were to be expected by ln p = {gain:.3g} more"
     yield f"{name}: χ² {step['chi2_before']:.1f} → {step['chi2_after']:.1f}{held}"
     if step.get("change_of_qu") is not None:
         size = f"{per_cent(step['change_of_qu'])} %"

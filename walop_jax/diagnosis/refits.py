@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import grammar, thresholds
-from walop_jax.diagnosis.design import Design, exposure_folds, held_out
+from walop_jax.diagnosis.design import Design, exposure_folds, folds, held_out
 from walop_jax.diagnosis.exact import (
     Trial,
     context_of,
@@ -243,8 +243,7 @@ def contradicting(before: Design, after: Design) -> str:
     names = np.unique(kinds)
     if len(names) < 2:
         return ""
-    first, second = ((d.jacobian, d.residual, d.projector.free, d.fit.noise_scale) for d in (before, after))
-    worse = (gains_of_units(kinds, first, second) < -thresholds.CERTAIN_ODDS).all(axis=0)
+    worse = (gains_of_units(kinds, *map(_laid_out, (before, after))) < -thresholds.CERTAIN_ODDS).all(axis=0)
     return ", ".join(f"KIND {kind}" for kind in names[worse])
 
 
@@ -268,6 +267,10 @@ def refitted_in_order(steps: Sequence[Trial], start: Design, end: Design) -> lis
 LaidOut = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, " _"], int, float]
 
 
+def _laid_out(design: Design) -> LaidOut:
+    return design.jacobian, design.residual, design.projector.free, design.fit.noise_scale
+
+
 def before_and_after(name: str, before: Design, after: Design) -> FitComparison:
     """The fits without and with an effect."""
     effect = after.fit.model.template.effect(name)
@@ -275,16 +278,28 @@ def before_and_after(name: str, before: Design, after: Design) -> FitComparison:
     scheme = "field blocks" if many or _of_one_fold(after, name) else "exposures"
     old, new = (instrument_matrices(design.fit) for design in (before, after))
     return FitComparison(
+        **held_out_by(before, after, scheme),
         chi2_before=before.fit.chi2,
         chi2_after=after.fit.chi2,
         dof_after=after.fit.dof,
-        heldout_scheme=scheme,
-        heldout_before=held_out(before, scheme),
-        heldout_after=held_out(after, scheme),
         change_of_qu=largest_change(old, new),
         residual_before=before.measured.residual,
         residual_after=after.measured.residual,
     )
+
+
+def held_out_by(before: Design, after: Design, scheme: str) -> dict[str, Any]:
+    """The part of a `FitComparison` about data that were left out, by folds of a scheme.
+
+    Only where their mean squared residual is larger does the gain in ln p decide.
+    """
+    old, new = held_out(before, scheme), held_out(after, scheme)
+    gain = float("nan")
+    if new >= old:
+        gain = float(gains_of_units(folds(before, scheme), _laid_out(before), _laid_out(after))[0].sum())
+    return {
+        "heldout_scheme": scheme, "heldout_before": old, "heldout_after": new, "heldout_gain": gain,
+    }  # fmt: skip
 
 
 def _of_one_fold(design: Design, name: str) -> bool:

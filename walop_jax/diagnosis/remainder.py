@@ -14,13 +14,14 @@ from scipy import special
 from walop_jax.calibration.accuracy import largest_change
 from walop_jax.calibration.matrix import instrument_matrices
 from walop_jax.diagnosis import thresholds
-from walop_jax.diagnosis.design import Design, held_out, pattern_in_words, strata
+from walop_jax.diagnosis.design import Design, pattern_in_words, strata
 from walop_jax.diagnosis.exact import Trial, context_of, evidence_of_presence, log_evidence_ratio, try_effect
 from walop_jax.diagnosis.examination import Examination
-from walop_jax.diagnosis.findings import Unexplained, describe
+from walop_jax.diagnosis.findings import FitComparison, Unexplained, describe
 from walop_jax.diagnosis.refits import (
     Refits,
     contradicting,
+    held_out_by,
     predicts_unseen,
     refitted_in_order,
     settled,
@@ -221,10 +222,11 @@ def _worse(first: Examination, state: State) -> str:
     # An effect with a number for each exposure cannot predict an exposure that is left out, only places of the field.
     schemes = [step.compared.heldout_scheme for step in state.steps]
     scheme = "exposures" if set(schemes) == {"exposures"} else "field blocks"
-    before, after = (held_out(evidence.design, scheme) for evidence in (first, state.evidence))
-    if after > before:
-        return f"{scheme} that are left out (mean squared residual {before:.3g} → {after:.3g})"
-    return ""
+    compared = FitComparison(**held_out_by(first.design, state.evidence.design, scheme))
+    if compared.confirmed:
+        return ""
+    means = f"{compared.heldout_before:.3g} → {compared.heldout_after:.3g}"
+    return f"{scheme} that are left out (mean squared residual {means})"
 
 
 def _not_adopted(first: State, state: State, worse: str) -> Remainder:

@@ -138,7 +138,7 @@ def against(trial: Trial) -> str:
     if trial.fit is not None and (far := _far_beyond(trial)):
         return far
     before, after = trial.compared.heldout_before, trial.compared.heldout_after
-    if after >= before:
+    if after >= before and not trial.compared.confirmed:
         return (
             f"data that were left out agree worse with it (mean squared residual {before:.4g} → {after:.4g})"
         )
