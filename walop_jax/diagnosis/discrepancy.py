@@ -26,9 +26,9 @@ Undetected   With elements that the model does not let vary, the matrix has erro
              their standard errors (`thresholds.MOST_WIDTHS`): these only shift the parameters. Of a change in exposures
              of one KIND nothing says whether stars have it, as a gain of standards, which are stars: they have it with
              a probability of a half. Numbers of which the data say nothing are those of `undetected_errors`.
-Starlight    To first order any such change acts on a star like changes ahead of the train and ahead of its arms: those
-             ahead of the train turn q and u alike, those of one arm q alone. A few changes there, chosen one after the
-             other (a Cholesky decomposition with pivots), carry the whole covariance of the matrix.
+Starlight    To first order any such change acts on a star like a change ahead of the train, but for a turn in one arm
+             alone: what is ahead of the train turns q and u alike. A few changes there, chosen one after the other (a
+             Cholesky decomposition with pivots), carry the covariance of the matrix.
 Sources      model discrepancy as a Gaussian process, Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; mean over
              models that were not chosen, Draper 1995, J. R. Stat. Soc. B 57, 45
 Limits       First order; in the usual setting of the plates. Undetected changes of finer structure are not in it.
@@ -65,7 +65,7 @@ from walop_jax.model.effects.factors import COUNTS, EXPOSURE
 from walop_jax.model.effects.optics import GENERATORS, generators_of
 from walop_jax.model.instrument import Instrument
 
-LEFT_OUT = 1e-2  # share of the variance of the elements of the matrix that a product may lack in the mean
+LEFT_OUT = 0.02  # share of the variance of the elements of the matrix that a product may lack in the mean
 DEGREES = tuple(sum(2 if factor in ("r2", "x2-y2", "xy") else 1 for factor in names) for names in CUBIC)
 
 
@@ -246,7 +246,7 @@ class _Block(NamedTuple):
 
 
 def undetected(laid: LinearisedFit) -> OpenQuestion | None:
-    """Covariance of undetected changes, by changes ahead of train and arms; None if there are none."""
+    """Covariance of undetected changes, expressed by changes ahead of the train; None if there are no such changes."""
     if not (places := _steady_places(laid)):
         return None
     step, data, front = laid.nothing_removed, _AtData.of(laid.columns), places[0]
@@ -256,11 +256,8 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     if not tried or front not in blocks:
         return None
     factor = _factor_of_matrix(laid, step, tried)
-    arms = tuple(f"{arm.name}." for arm in laid.template.arms)
-    ahead = [block for place, block in blocks.items() if place == front or _is_ahead_of(place, arms)]
-    sums = tuple(itertools.chain(*(block.sums for block in ahead)))
-    shifts = np.concatenate([block.slopes for block in ahead], axis=1)
-    slopes = _slopes(laid, sums, shifts)
+    ahead = blocks[front]
+    slopes = _slopes(laid, ahead.sums, ahead.slopes)
     total = np.sqrt(laid.errors**2 + np.sum(factor**2, axis=-1))
     unit = np.where(total > 0.0, total, np.inf)[..., None]
     chosen, loadings = _carrying(*((of / unit).reshape(total.size, -1) for of in (slopes, factor)))
@@ -271,10 +268,10 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     member = Answer(
         "undetected",
         0.0,
-        tuple(sums[j] for j in chosen),
+        tuple(ahead.sums[j] for j in chosen),
         amplitudes=np.zeros(len(chosen)),
         covariance=covariance,
-        slopes=shifts[:, chosen],
+        slopes=ahead.slopes[:, chosen],
     )
     return OpenQuestion.of_errors(
         "changes that the data would not show", member, laid.error_of_p(between), laid.stated
@@ -301,12 +298,6 @@ def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
     places = list(itertools.chain(*places_of(bare, laid.fit.calset.exposures)))
     front = places[:1] if bare.ahead_of_polariser is None else [bare.ahead_of_polariser]
     return [*front, *(place for place in places if place not in front)]
-
-
-def _is_ahead_of(place: tuple[str, str], prefixes: tuple[str, ...]) -> bool:
-    """True of a place ahead of an element whose name begins with one of `prefixes`."""
-    where, element = place
-    return where == "ahead of" and element.startswith(prefixes)
 
 
 def _block(laid: LinearisedFit, step: LinearStep, data: _AtData, where: str, place: str) -> _Block | None:
