@@ -43,7 +43,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special
+from scipy import linalg, special
 
 from walop_jax.calibration.matrix import of_matrix
 from walop_jax.diagnosis import thresholds
@@ -260,7 +260,10 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     slopes = _slopes(laid, ahead.sums, ahead.slopes)
     total = np.sqrt(laid.errors**2 + np.sum(factor**2, axis=-1))
     unit = np.where(total > 0.0, total, np.inf)[..., None]
-    chosen, loadings = _carrying(*((of / unit).reshape(total.size, -1) for of in (slopes, factor)))
+    columns, whole = ((of / unit).reshape(total.size, -1) for of in (slopes, factor))
+    chosen, loadings = _carrying(
+        columns, square_root(whole @ whole.T)
+    )  # the same covariance by fewer columns
     if not chosen:
         return None
     covariance = loadings @ loadings.T
@@ -289,7 +292,7 @@ def _factor_of_matrix(
     ]
     numbers = laid.slopes @ _of_stated_numbers(laid, step)
     of_stars, alone = _of_exposures(laid, step)
-    return np.concatenate([*steady, *of_stars, laid.slopes @ alone, numbers], axis=-1)
+    return np.concatenate([*steady, of_stars, laid.slopes @ alone, numbers], axis=-1)
 
 
 def _steady_places(laid: LinearisedFit) -> list[tuple[str, str]]:
@@ -365,32 +368,31 @@ def _second_moment(
     return vector @ (covariance + np.outer(mean, mean)) @ vector.T
 
 
-def _of_exposures(
-    laid: LinearisedFit, step: LinearStep
-) -> tuple[list[Float[np.ndarray, "p m _"]], AnyMatrix]:
-    """Undetected changes that differ between exposures: factors F of their covariances F Fᵀ.
+def _of_exposures(laid: LinearisedFit, step: LinearStep) -> tuple[Float[np.ndarray, "p m _"], AnyMatrix]:
+    """Undetected changes that differ between exposures: factors F of two covariances F Fᵀ.
 
     These are the candidates of an examination that depend on time, temperature, KIND, counts or an exposure, or that
     do not change the light of a star. Those in exposures of one KIND are in the light of stars with a probability of a
-    half: the first factors are of the covariance of the matrix then. All others only shift the free parameters, of
-    whose covariance the last factor is.
+    half: the first factor is of the covariance of the matrix then. All others only shift the free parameters, of whose
+    covariance the second factor is.
     """
     state, count = laid.state, len(laid.fit.model.free)
     differing = [probe for probe in state.asked if _no_starlight(probe, laid.template)]
-    of_stars, covariance = list[AnyMatrix](), np.zeros((count, count))
-    if not differing:
-        return of_stars, covariance[:, :0]
     scores, places = laid.design.products(state.columns, step.left), state.bare.places()
     slopes = -step.projector.taken_up(laid.design.products(state.columns, step.projector.basis).T)
-    odds = _odds(len(differing))
+    covariance, odds = np.zeros((count, count)), _odds(len(differing))
+    sums, shifts, roots = list[WeightedChanges](), [slopes[:, :0]], [np.zeros((0, 0))]
     for probe in differing:
         at = places[probe.name]
         moment = _second_moment(state.bare.gram[at, at], scores[at], probe.widths, odds, state.scatter)
-        if sums := _of_stars_as_well(laid, probe):
+        if on_stars := _of_stars_as_well(laid, probe):
             moment *= 0.5
-            of_stars.append(_slopes(laid, sums, slopes[:, at]) @ square_root(moment))
+            sums += on_stars
+            shifts.append(slopes[:, at])
+            roots.append(square_root(moment))
         covariance += slopes[:, at] @ moment @ slopes[:, at].T
-    return of_stars, square_root(covariance)
+    of_matrix = _slopes(laid, sums, np.concatenate(shifts, axis=1)) @ linalg.block_diag(*roots)
+    return of_matrix, square_root(covariance)
 
 
 def _of_stars_as_well(laid: LinearisedFit, probe: Probe) -> tuple[WeightedChanges, ...]:
