@@ -94,7 +94,9 @@ def test_a_change_that_gained_nothing_is_not_compared_again(south, monkeypatch):
 def test_a_structural_effect_that_was_refuted_is_not_fitted_again(south, monkeypatch, evidence, tried):
     """One that an earlier round left out for another reason is."""
     fits = list[str]()
-    monkeypatch.setattr(refits, "try_effect", lambda _, effect: fits.append(effect.name) or Mock(exact.Trial))
+    monkeypatch.setattr(
+        refits, "try_effect", lambda _, effect: fits.append(effect.name) or Mock(exact.Trial, fit=None)
+    )
     monkeypatch.setattr(refits, "context_of", lambda result: PLAN.context())
     monkeypatch.setattr(refits, "other_descriptions", lambda *_, **__: ([], {}))
     plate = effect_by_name("chwp_in_beam")
