@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,6 +42,7 @@ from walop_jax.model.instrument import Instrument, nominal_instrument  # noqa: E
 from walop_jax.simulation.observing_plan import NO_SKY, ObservingPlan, polariser_turn  # noqa: E402
 from walop_jax.simulation.simulate import simulate  # noqa: E402
 
+MANY = 10  # mistakes after which the programs so far are forgotten
 WITH_PLATE = ObservingPlan(
     grid=4,
     standard_grid=2,
@@ -483,7 +485,9 @@ def main() -> int:
 
     signal.signal(signal.SIGPROF, over)
     right, spent = 0, []
-    for instrument, name, case in chosen(options):
+    for count, (instrument, name, case) in enumerate(chosen(options)):
+        if count and count % MANY == 0:
+            jax.clear_caches()  # the programs of all forty do not fit into the memory maps of one process
         calset = case.made(options.seed)
         began = used()
         signal.setitimer(signal.ITIMER_PROF, options.seconds)
