@@ -40,6 +40,7 @@ from astropy.table import Table  # noqa: E402
 from handmade_set import Handmade  # noqa: E402
 from study_options import options_of  # noqa: E402
 
+from walop_jax.calibration.calibration import UnavailableInstrument  # noqa: E402
 from walop_jax.calibration.product import read_calibration, write_calibration  # noqa: E402
 from walop_jax.data.calset import read_calibration_set  # noqa: E402
 from walop_jax.data.user_tables import read_input_table  # noqa: E402
@@ -79,6 +80,10 @@ def digest(value: Any) -> str:
     found = hashlib.sha256()
 
     def add(part: Any) -> None:
+        if isinstance(
+            part, UnavailableInstrument
+        ):  # of a product by another version: it answers with its reason
+            part = str(part.reason)
         if dataclasses.is_dataclass(part) and not isinstance(part, type):
             part = {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}
         if isinstance(part, Mapping):
