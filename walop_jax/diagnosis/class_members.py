@@ -341,10 +341,9 @@ class LinearStep:
         if not changes or not of_standards:
             return None
 
-        def everywhere(change: Change) -> Change:
-            return dataclasses.replace(change, factors=tuple(f for f in change.factors if f != _STANDARDS))
-
-        sums = tuple(tuple((size, everywhere(c)) for size, c in amplitude) for amplitude in addition.sums)
+        sums = tuple(
+            tuple((size, c.without(_STANDARDS)) for size, c in amplitude) for amplitude in addition.sums
+        )
         if not self._can_be_said(sums):
             return None
         column = self.laid.design.stacked([self.laid.columns.of(addition.sums)])

@@ -261,9 +261,8 @@ def undetected(laid: LinearisedFit) -> OpenQuestion | None:
     total = np.sqrt(laid.errors**2 + np.sum(factor**2, axis=-1))
     unit = np.where(total > 0.0, total, np.inf)[..., None]
     columns, whole = ((of / unit).reshape(total.size, -1) for of in (slopes, factor))
-    chosen, loadings = _carrying(
-        columns, square_root(whole @ whole.T)
-    )  # the same covariance by fewer columns
+    few = square_root(whole @ whole.T)  # the same covariance by fewer columns
+    chosen, loadings = _carrying(columns, few)
     if not chosen:
         return None
     covariance = loadings @ loadings.T
@@ -402,13 +401,7 @@ def _of_stars_as_well(laid: LinearisedFit, probe: Probe) -> tuple[WeightedChange
     if len(kinds) != 1:
         return ()
     (kind,) = kinds
-    steady = tuple(
-        tuple(
-            (size, dataclasses.replace(c, factors=tuple(f for f in c.factors if f != kind.text)))
-            for size, c in total
-        )
-        for total in groups
-    )
+    steady = tuple(tuple((size, c.without(kind.text)) for size, c in total) for total in groups)
     same = all(kind.text in c.factors for total in groups for _, c in total)
     return steady if same and all(map(laid.columns.has, steady)) else ()
 

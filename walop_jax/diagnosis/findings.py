@@ -586,7 +586,7 @@ def _of_step(step: Mapping[str, Any]) -> Iterator[str]:
         means = f"{step['heldout_before']:.3g} → {step['heldout_after']:.3g}"
         held = f"; mean squared residual of data left out ({step.get('heldout_scheme', '')}) {means}"
         if (gain := step.get("heldout_gain")) is not None:
-            held += f", which were to be expected by ln p = {gain:.3g} more"
+            held += f", ln p of these data larger by {gain:.3g}"
     yield f"{name}: χ² {step['chi2_before']:.1f} → {step['chi2_after']:.1f}{held}"
     if step.get("change_of_qu") is not None:
         size = f"{per_cent(step['change_of_qu'])} %"

@@ -234,6 +234,10 @@ class Change:
         """The change with further factors."""
         return dataclasses.replace(self, factors=(*self.factors, *factors))
 
+    def without(self, factor: str) -> Change:
+        """The change without a factor."""
+        return dataclasses.replace(self, factors=tuple(f for f in self.factors if f != factor))
+
     def width(self, largest: Mapping[str, float]) -> float:
         """Prior width of the amplitude: the change is as large as its kind may be where its factors are largest.
 
